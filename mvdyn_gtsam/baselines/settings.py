@@ -1,0 +1,41 @@
+"""What a baseline is run with; the defaults are the paper's."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+Method = Literal["colmap", "glomap"]
+METHODS: tuple[Method, ...] = ("colmap", "glomap")
+
+Pairing = Literal["window", "exhaustive"]
+
+
+@dataclass(frozen=True)
+class BaselineSettings:
+    """Settings of COLMAP and GLOMAP; every default is the paper's (supplement, "Parameters setting")."""
+
+    intra_window: int = 10
+    """Frame i is matched with frames i-10 .. i+10 of its own camera."""
+    inter_window: int = 5
+    """Frame i is matched with frames i-5 .. i+5 of every other camera."""
+    pairing: Pairing = "window"
+    """``window`` as in the paper; ``exhaustive``: every image with every other, a control without retrieval."""
+    masks: Path | None = None
+    """Folder ``<camera>/<%06d>.png`` with 255 where something moves; no features are taken there."""
+    num_threads: int = -1
+    """Threads of every phase; -1: all cores."""
+    random_seed: int = 0
+    """Fixes RANSAC and the random start of global positioning."""
+
+    def to_json(self) -> dict[str, Any]:
+        values = dataclasses.asdict(self)
+        values["masks"] = None if self.masks is None else str(self.masks)
+        return values
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> BaselineSettings:
+        masks = values.get("masks")
+        return BaselineSettings(**{**values, "masks": None if masks is None else Path(masks)})
