@@ -1,0 +1,235 @@
+"""Writing a reconstruction while it is being computed: at any moment the folder can be read and resumed."""
+
+from __future__ import annotations
+
+import io
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.errors import ResultError
+from mvdyn_gtsam.reconstruction.encoding import encode_confidence, encode_depth
+from mvdyn_gtsam.reconstruction.files import format_tum, write_atomically, write_json
+from mvdyn_gtsam.reconstruction.layout import arrays_path, confidence_path, depth_path, trajectory_path
+from mvdyn_gtsam.reconstruction.manifest import (
+    MANIFEST_NAME,
+    CaptureInfo,
+    Status,
+    is_reconstruction,
+    new_manifest,
+    read_manifest,
+)
+
+log = logging.getLogger(__name__)
+
+_OUR_FOLDERS = ("trajectories", "depth", "confidence", "diagnostics")
+
+
+class ReconstructionWriter:
+    """Writes one reconstruction folder; use as a context manager, which records how the run ended.
+
+    Every method raises ResultError (one line, naming the file) when the disk is full or a file cannot
+    be written; files written before stay whole.
+    """
+
+    def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
+        self.folder = folder
+        self._manifest = manifest
+        self._sizes = {c["name"]: (c["height"], c["width"]) for c in manifest["capture"]["cameras"]}
+        self._frame_count = int(manifest["capture"]["frame_count"])
+
+    @staticmethod
+    def create(
+        folder: Path | str,
+        capture_info: CaptureInfo,
+        config: Mapping[str, Any],
+        *,
+        resume: bool = False,
+        overwrite: bool = False,
+        unit: str = "arbitrary",
+    ) -> ReconstructionWriter:
+        """Open ``folder`` for writing and put its manifest there with status ``running``.
+
+        ``config`` is ``mvdyn_gtsam.config.to_dict(config)``; ``unit`` is "arbitrary" or "metric". With
+        ``resume`` an existing reconstruction of the same capture and configuration is continued (what
+        is there stays; a folder that does not exist yet is started). With ``overwrite`` an existing
+        reconstruction is removed first. Raises ResultError when the folder holds anything else.
+        """
+        folder = Path(folder)
+        refuse_unusable(folder, resume=resume, overwrite=overwrite)
+        fresh = new_manifest(capture_info, config, unit)
+        if resume and is_reconstruction(folder):
+            manifest = read_manifest(folder)
+            _refuse_mismatch(folder, manifest, fresh)
+            manifest.update(status=Status.RUNNING.value, config=fresh["config"], versions=fresh["versions"])
+        else:
+            if is_reconstruction(folder):
+                _remove_reconstruction(folder)
+            manifest = fresh
+        writer = ReconstructionWriter(folder, manifest)
+        writer._write_manifest()
+        return writer
+
+    def __enter__(self) -> ReconstructionWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self._set_status(Status.COMPLETE)
+            return
+        try:
+            self._set_status(Status.INTERRUPTED if issubclass(kind, KeyboardInterrupt) else Status.FAILED)
+        except ResultError as problem:  # must not hide the error that ended the run
+            log.warning("the manifest still says running: %s", problem)
+
+    def write_trajectory(
+        self, camera: str, timestamps: npt.NDArray[np.float64], wTc: npt.NDArray[np.float64]
+    ) -> None:
+        """Write poses ``wTc`` ``(T, 4, 4)`` at ``timestamps`` ``(T,)`` s, one per frame; NaN = no pose."""
+        self._check_camera(camera)
+        if wTc.shape != (self._frame_count, 4, 4) or timestamps.shape != (self._frame_count,):
+            raise ValueError(
+                f"{camera}: poses {wTc.shape}, timestamps {timestamps.shape} for {self._frame_count} frames"
+            )
+        write_atomically(trajectory_path(self.folder, camera), format_tum(timestamps, wTc).encode())
+
+    def write_depth(
+        self,
+        camera: str,
+        time: int,
+        depth: npt.NDArray[np.floating],
+        confidence: npt.NDArray[np.floating],
+    ) -> None:
+        """Write depth ``(H, W)`` (NaN = invalid) and confidence ``(H, W)`` in [0, 1] of frame ``time``."""
+        self._check_frame(camera, time)
+        if depth.shape != self._sizes[camera] or confidence.shape != self._sizes[camera]:
+            raise ValueError(
+                f"{camera}: depth {depth.shape}, confidence {confidence.shape}, frame {self._sizes[camera]}"
+            )
+        content, dropped = encode_depth(depth)
+        if dropped:
+            log.warning(
+                "%s frame %d: %d depths outside the storable range are invalid", camera, time, dropped
+            )
+        # Depth last: its presence says that both files of the frame are there.
+        write_atomically(confidence_path(self.folder, camera, time), encode_confidence(confidence))
+        write_atomically(depth_path(self.folder, camera, time), content)
+
+    def has_depth(self, camera: str, time: int) -> bool:
+        """Whether depth and confidence of that frame are on disk."""
+        self._check_frame(camera, time)
+        return depth_path(self.folder, camera, time).is_file()
+
+    def write_arrays(self, name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Write ``diagnostics/<name>.npz`` (e.g. covariances); read with ``Reconstruction.arrays``."""
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **dict(arrays))
+        write_atomically(arrays_path(self.folder, name), buffer.getvalue())
+
+    def set_groups(self, groups: Sequence[Sequence[str]]) -> None:
+        """Set the lists of cameras that share a world frame; every camera may be in one group at most."""
+        for group in groups:
+            for camera in group:
+                self._check_camera(camera)
+        self._manifest["groups"] = [list(group) for group in groups]
+        self._write_manifest()
+
+    def set_unit(self, unit: str) -> None:
+        """Set the unit of translations and depth: "arbitrary" or "metric"."""
+        if unit not in ("arbitrary", "metric"):
+            raise ValueError(f"unit {unit!r} is neither 'arbitrary' nor 'metric'")
+        self._manifest["unit"] = unit
+        self._write_manifest()
+
+    def set_diagnostics(self, name: str, value: Any) -> None:
+        """Write ``diagnostics/<name>.json``: anything JSON-able, e.g. edge counts per time step."""
+        write_json(self.folder / "diagnostics" / f"{name}.json", value)
+
+    def add_note(self, note: str) -> None:
+        """Add a sentence for the user to the manifest; the same sentence is kept once."""
+        if note not in self._manifest["notes"]:
+            self._manifest["notes"].append(note)
+            self._write_manifest()
+
+    def finish_stage(self, name: str, seconds: float, notes: Sequence[str] = ()) -> None:
+        """Record that stage ``name`` is finished and took ``seconds``."""
+        stages = [stage for stage in self._manifest["stages"] if stage["name"] != name]
+        stages.append({"name": name, "seconds": float(seconds), "notes": list(notes)})
+        self._manifest["stages"] = stages
+        self._write_manifest()
+
+    def stage_finished(self, name: str) -> bool:
+        """Whether stage ``name`` was finished, in this run or in the one that is resumed."""
+        return any(stage["name"] == name for stage in self._manifest["stages"])
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the finished stages, in order."""
+        return tuple(stage["name"] for stage in self._manifest["stages"])
+
+    def _set_status(self, status: Status) -> None:
+        self._manifest["status"] = status.value
+        self._write_manifest()
+
+    def _write_manifest(self) -> None:
+        write_json(self.folder / MANIFEST_NAME, self._manifest)
+
+    def _check_camera(self, camera: str) -> None:
+        if camera not in self._sizes:
+            raise ValueError(f"unknown camera {camera!r}; the capture has {', '.join(self._sizes)}")
+
+    def _check_frame(self, camera: str, time: int) -> None:
+        self._check_camera(camera)
+        if not 0 <= time < self._frame_count:
+            raise ValueError(f"{camera}: frame {time} outside 0..{self._frame_count - 1}")
+
+
+def refuse_unusable(folder: Path, *, resume: bool, overwrite: bool) -> None:
+    """Raise ResultError unless a run may write to ``folder``: absent, empty, or ours and allowed."""
+    if folder.exists() and not folder.is_dir():
+        raise ResultError(f"{folder}: is a file; choose another --out")
+    if not folder.exists() or not any(folder.iterdir()):
+        return
+    if not is_reconstruction(folder):
+        raise ResultError(f"{folder}: not empty and not a reconstruction; choose another --out")
+    if not (resume or overwrite):
+        raise ResultError(
+            f"{folder}: already holds a reconstruction; add --resume to continue it or --overwrite"
+        )
+
+
+def _refuse_mismatch(folder: Path, manifest: Mapping[str, Any], fresh: Mapping[str, Any]) -> None:
+    for key, value in fresh["capture"].items():
+        if manifest["capture"].get(key) != value:
+            raise ResultError(
+                f"{folder}: was made from another capture ({key} differs);"
+                " choose another --out or --overwrite"
+            )
+    refined = any(stage["name"] == "refinement" for stage in manifest["stages"])
+    for section in sorted(set(fresh["config"]) | set(manifest["config"])):
+        if section == "refinement" and not refined:  # nothing on disk depends on it yet
+            continue
+        if manifest["config"].get(section) != fresh["config"].get(section):
+            raise ResultError(
+                f"{folder}: was made with another configuration (section {section!r});"
+                " resume with the same one, or --overwrite"
+            )
+
+
+def _remove_reconstruction(folder: Path) -> None:
+    # The manifest last: were the removal interrupted, the folder is still known as ours.
+    try:
+        for name in _OUR_FOLDERS:
+            if (folder / name).exists():
+                shutil.rmtree(folder / name)
+        (folder / MANIFEST_NAME).unlink()
+    except OSError as error:
+        raise ResultError(f"{folder}: cannot be overwritten ({error.strerror})") from error
