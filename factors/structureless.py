@@ -1,0 +1,372 @@
+"""Flow of one keyframe to its neighbours with every grid point's log depth eliminated inside the factor.
+
+Unknowns of keyframe i: its pose, the poses of E neighbours j, a log depth scale S_i and, per grid point k, the log
+depth l_k. Cost, in the metric ``1/2 ||.||^2``::
+
+    sum_e,k  weight_ek / noise_px^2 * rho(||pi(K_j, jTi exp(l_k) ray_k) - target_ek||)
+  + sum_k    1/2 ((l_k - S_i - prior_log_depth_k) / prior_sigma_k)^2
+
+At every evaluation the l_k are minimised over at the given poses by a fixed number of damped Gauss-Newton steps from
+the stored start (no state is kept), and the Gauss-Newton system in the poses is what remains after eliminating them:
+one scalar Schur complement per point, cf. "smart factors" (Carlone et al., ICRA 2014) and the point elimination of
+bundle adjustment (Triggs et al., 2000).
+
+The factor returns the system in square-root form of 6 E + 2 rows. Its error vector is ``[0, ..., 0, sqrt(2 cost)]`` with
+and without Jacobians, so ``error()`` is exactly the robust cost, and ``J^T e`` is exactly the gradient of the
+re-weighted system; Levenberg-Marquardt therefore accepts or rejects by the true robust cost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from factors.compression import compress_gram, rotate_residual_to_last
+from factors.flow_terms import EdgeRays, FlowTerms, edge_rays, flow_terms, weighted_rows
+from factors.projection import adjoint, relative_poses
+from factors.robust import Loss, LossName, make_loss
+
+Array = npt.NDArray[np.float64]
+
+LOG_DEPTH_RANGE = 4.0
+"""A log depth stays within this of its start (a factor of 55); a point at the limit counts as known, not as free."""
+MAXIMUM_STEP = 0.7
+"""Longest single log-depth step (a factor of 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class StructurelessMeasurement:
+    """Dense flow of the N grid points of keyframe i to E frames; arrays are copied and made read-only.
+
+    Raises ValueError when shapes disagree, a depth start is not finite or a weight is negative. NaN targets or weights
+    count as no measurement, a NaN prior log depth or an infinite sigma as no prior.
+    """
+
+    rays: Array
+    """``(N, 3)`` with z = 1, in frame i."""
+    initial_log_depth: Array
+    """``(N,)`` where the solution for the log depths starts."""
+    prior_log_depth: Array
+    """``(N,)`` mean of the prior before the scale: log D_i."""
+    prior_sigma: Array
+    """``(N,)`` standard deviation of the prior, in log depth."""
+    intrinsics_j: Array
+    """``(E, 4)`` fx fy cx cy, px."""
+    target: Array
+    """``(E, N, 2)`` where the flow leads, px in frame j."""
+    weight: Array
+    """``(E, N)`` in [0, 1]; 0 is no measurement."""
+    robust_px: float = 1.0
+    """Scale of the robust loss, px."""
+    noise_px: float = 1.0
+    """Standard deviation of a flow component of weight one, px."""
+    loss: LossName = "cauchy"
+    steps: int = 4
+    """Gauss-Newton steps for the log depths per evaluation."""
+    kernel: Loss = field(init=False, repr=False)
+    """The robust loss itself."""
+    planar_rays: Array = field(init=False, repr=False)
+    """``(3, N)``"""
+    planar_target: Array = field(init=False, repr=False)
+    """``(2, E, N)``; zero where there is no measurement."""
+    information: Array = field(init=False, repr=False)
+    """``(E, N)`` weight over squared noise."""
+    prior_information: Array = field(init=False, repr=False)
+    """``(N,)``, 1 / sigma^2."""
+
+    def __post_init__(self) -> None:
+        _check_shapes(self)
+        if not self.noise_px > 0.0:
+            raise ValueError(f"noise_px must be positive, got {self.noise_px}")
+        target = np.asarray(self.target, dtype=np.float64)
+        weight = np.asarray(self.weight, dtype=np.float64)
+        measured = np.isfinite(target).all(axis=2) & np.isfinite(weight)
+        weight = np.where(measured, weight, 0.0)
+        planar_target = np.where(measured, np.moveaxis(target, 2, 0), 0.0)
+        prior = np.asarray(self.prior_log_depth, dtype=np.float64)
+        sigma = np.asarray(self.prior_sigma, dtype=np.float64)
+        if (weight < 0.0).any():
+            raise ValueError("weights must not be negative")
+        if not np.isfinite(self.initial_log_depth).all():
+            raise ValueError("every initial log depth must be finite")
+        if not (sigma > 0.0).all():
+            raise ValueError("every prior sigma must be positive (use inf for no prior)")
+        has_prior = np.isfinite(prior)
+        arrays = {
+            "planar_rays": np.asarray(self.rays, dtype=np.float64).T,
+            "initial_log_depth": self.initial_log_depth,
+            "prior_log_depth": np.where(has_prior, prior, 0.0),
+            "prior_sigma": sigma,
+            "prior_information": np.where(has_prior, sigma**-2.0, 0.0),
+            "intrinsics_j": self.intrinsics_j,
+            "planar_target": planar_target,
+            "weight": weight,
+            "information": weight / self.noise_px**2,
+        }
+        for name, array in arrays.items():
+            object.__setattr__(self, name, _frozen(array))
+        object.__setattr__(self, "rays", self.planar_rays.T)
+        # a view: the planar copy is the only one kept
+        object.__setattr__(self, "target", np.moveaxis(self.planar_target, 0, 2))
+        object.__setattr__(self, "kernel", make_loss(self.loss, self.robust_px))
+
+
+@dataclass(frozen=True)
+class EdgeResiduals:
+    """How well each edge of a keyframe fits, for choosing, re-measuring and diagnosing edges."""
+
+    count: npt.NDArray[np.int64]
+    """``(E,)`` points with a measurement."""
+    rms_px: Array
+    """``(E,)`` root mean square residual weighted by measurement weight, behind-camera points left out; NaN if none."""
+    median_px: Array
+    """``(E,)`` median residual of the measured points; NaN if none."""
+    inlier_fraction: Array
+    """``(E,)`` weighted fraction of measurement with residual below twice the robust scale; 0 if none."""
+    norms_px: Array
+    """``(E, N)`` residual norms; NaN where nothing is measured, inf behind the camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    """Everything known after the log depths were solved."""
+
+    cost: float
+    log_depth: Array
+    free: npt.NDArray[np.bool_]
+    gradient: Array
+    hessian: Array
+    prior_gradient: Array
+    depth: Array
+    jTi: Array
+    rays: EdgeRays
+    terms: FlowTerms
+
+
+def evaluate(
+    measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float
+) -> tuple[float, Array]:
+    """Robust cost and the solved log depths ``(N,)`` at ``wTi (4, 4)``, ``wTj (E, 4, 4)`` and ``log_scale``."""
+    solution = _solve(measurement, wTi, wTj, log_scale)
+    return solution.cost, solution.log_depth
+
+
+def solve_log_depths(
+    measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float
+) -> tuple[Array, Array]:
+    """Log depths ``(N,)`` at given poses and their information ``(N,)`` (inverse variance, poses held fixed)."""
+    solution = _solve(measurement, wTi, wTj, log_scale)
+    return solution.log_depth, solution.hessian
+
+
+def linearize(measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float) -> Array:
+    """Compressed rows ``(6 E + 2, 6 (E + 1) + 2)`` = ``[d/dwTi | d/dwTj_1 | ... | d/dlog_scale | error]``.
+
+    Derivatives are for right perturbations of the poses. The last column is ``[0, ..., 0, sqrt(2 cost)]``.
+    """
+    solution = _solve(measurement, wTi, wTj, log_scale)
+    root = rotate_residual_to_last(compress_gram(_reduced_gram(measurement, solution)))
+    twists = 6 * len(wTj)
+    rows = np.empty((len(root), twists + 8))
+    # jTi changes by Ad(jTi) of the change of wTi, minus the change of wTj
+    rows[:, :6] = root[:, :twists] @ adjoint(solution.jTi).reshape(twists, 6)
+    np.negative(root[:, :twists], out=rows[:, 6 : twists + 6])
+    rows[:, twists + 6 :] = root[:, twists:]
+    return rows
+
+
+def edge_residuals(
+    measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float
+) -> EdgeResiduals:
+    """Residual statistics per edge at the solved log depths."""
+    solution = _solve(measurement, wTi, wTj, log_scale)
+    weight = measurement.weight
+    measured = weight > 0.0
+    seen = measured & (solution.terms.weight > 0.0)
+    squared = solution.terms.squared_norm
+    norms = np.where(measured, np.where(seen, np.sqrt(squared), np.inf), np.nan)
+    count = measured.sum(axis=1)
+    edges = range(len(weight))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rms = np.sqrt((weight * squared * seen).sum(axis=1) / (weight * seen).sum(axis=1))
+    inlier_weight = (weight * (norms < 2.0 * measurement.robust_px)).sum(axis=1)
+    total_weight = weight.sum(axis=1)
+    return EdgeResiduals(
+        count=count,
+        rms_px=rms,
+        median_px=np.array([np.median(norms[e, measured[e]]) if count[e] else np.nan for e in edges]),
+        inlier_fraction=np.divide(
+            inlier_weight, total_weight, out=np.zeros_like(total_weight), where=count > 0
+        ),
+        norms_px=norms,
+    )
+
+
+def structureless_flow_factor(
+    measurement: StructurelessMeasurement,
+    pose_i_key: int,
+    pose_j_keys: list[int],
+    scale_key: int | None,
+    log_scale: float = 0.0,
+) -> gtsam.CustomFactor:
+    """The factor over ``[X_i, X_j1, ..., X_jE, S_i]``; poses are ``Pose3``, the scale is a double.
+
+    With ``scale_key=None`` the scale is no variable but fixed at ``log_scale``. Raises ValueError when the number of
+    keys does not match the measurement or a pose appears twice.
+    """
+    edges = len(measurement.weight)
+    if len(pose_j_keys) != edges:
+        raise ValueError(f"measurement has {edges} edges but {len(pose_j_keys)} neighbour keys were given")
+    keys = [pose_i_key, *pose_j_keys] + ([] if scale_key is None else [scale_key])
+    if len(set(keys)) != len(keys):
+        raise ValueError("every key of a structureless factor must be different: merge edges to the same frame")
+    error = partial(_factor_error, measurement, scale_key is not None, log_scale)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6 * edges + 2), keys, error)
+
+
+def _factor_error(
+    measurement: StructurelessMeasurement,
+    has_scale: bool,
+    log_scale: float,
+    this: gtsam.CustomFactor,
+    values: gtsam.Values,
+    jacobians: list[Array] | None,
+) -> Array:
+    keys = this.keys()
+    edges = len(measurement.weight)
+    wTi = values.atPose3(keys[0]).matrix()
+    wTj = np.stack([values.atPose3(key).matrix() for key in keys[1 : edges + 1]])
+    if has_scale:
+        log_scale = values.atDouble(keys[edges + 1])
+    if jacobians is None:
+        error = np.zeros(6 * edges + 2)
+        error[-1] = np.sqrt(2.0 * _solve(measurement, wTi, wTj, log_scale).cost)
+        return error
+    rows = linearize(measurement, wTi, wTj, log_scale)
+    for pose in range(edges + 1):
+        jacobians[pose] = np.asfortranarray(rows[:, 6 * pose : 6 * pose + 6])
+    if has_scale:
+        jacobians[edges + 1] = np.asfortranarray(rows[:, -2:-1])
+    return rows[:, -1]
+
+
+def _solve(measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float) -> _Solution:
+    """Minimise over each log depth, a scalar Levenberg-Marquardt per point, all points at once."""
+    jTi = relative_poses(wTi, wTj)
+    rays = edge_rays(measurement.planar_rays, jTi, measurement.intrinsics_j)
+    mean = measurement.prior_log_depth + log_scale
+    prior_information = measurement.prior_information
+    lower = measurement.initial_log_depth - LOG_DEPTH_RANGE
+    upper = measurement.initial_log_depth + LOG_DEPTH_RANGE
+
+    def at(log_depth: Array) -> tuple[FlowTerms, Array, Array, Array]:
+        terms = flow_terms(
+            rays, np.exp(log_depth), measurement.planar_target, measurement.information, measurement.kernel
+        )
+        offset = log_depth - mean
+        prior_gradient = prior_information * offset
+        cost = (measurement.kernel.cost(terms.squared_norm) * measurement.information).sum(axis=0)
+        cost += 0.5 * prior_gradient * offset
+        slope, residual = terms.by_log_depth, terms.residual
+        gradient = ((slope[0] * residual[0] + slope[1] * residual[1]) * terms.weight).sum(axis=0)
+        gradient += prior_gradient
+        hessian = ((slope[0] * slope[0] + slope[1] * slope[1]) * terms.weight).sum(axis=0)
+        hessian += prior_information
+        return terms, cost, gradient, hessian
+
+    log_depth = measurement.initial_log_depth
+    terms, cost, gradient, hessian = at(log_depth)
+    damping = np.full(len(log_depth), 1e-4)
+    current = True
+    for _ in range(measurement.steps):
+        step = -gradient / (hessian * (1.0 + damping) + 1e-12)
+        candidate = np.clip(log_depth + np.clip(step, -MAXIMUM_STEP, MAXIMUM_STEP), lower, upper)
+        terms, new_cost, new_gradient, new_hessian = at(candidate)
+        # the margin keeps rounding at convergence from being taken for a failed step
+        better = new_cost <= cost * (1.0 + 1e-12)
+        current = bool(better.all())
+        if current:
+            log_depth, cost, gradient, hessian = candidate, new_cost, new_gradient, new_hessian
+        else:
+            log_depth = np.where(better, candidate, log_depth)
+            cost = np.where(better, new_cost, cost)
+            gradient = np.where(better, new_gradient, gradient)
+            hessian = np.where(better, new_hessian, hessian)
+        damping = np.where(better, damping * 0.1, damping * 100.0)
+    if not current:
+        terms, cost, gradient, hessian = at(log_depth)
+    return _Solution(
+        cost=float(cost.sum()),
+        log_depth=log_depth,
+        free=(log_depth > lower) & (log_depth < upper),
+        gradient=gradient,
+        hessian=hessian,
+        prior_gradient=prior_information * (log_depth - mean),
+        depth=np.exp(log_depth),
+        jTi=jTi,
+        rays=rays,
+        terms=terms,
+    )
+
+
+def _reduced_gram(measurement: StructurelessMeasurement, solution: _Solution) -> Array:
+    """Gram matrix ``(6 E + 2, 6 E + 2)`` over ``[twists of jTi | log scale | residual]``, log depths eliminated."""
+    rows, by_log_depth = weighted_rows(solution.rays, solution.terms, solution.depth, measurement.intrinsics_j)
+    edges, points = solution.terms.weight.shape
+    twists = 6 * edges
+    flat = rows.reshape(edges, 7, 2 * points)
+    blocks = flat @ flat.swapaxes(1, 2)
+    coupling = rows[:, :, 0] * by_log_depth[0][:, None]
+    coupling += rows[:, :, 1] * by_log_depth[1][:, None]
+    # per point: derivative of the log-depth gradient by [twists | log scale], and that gradient itself
+    columns = np.empty((twists + 2, points))
+    inverse_root = _inverse_root(solution.hessian, solution.free)
+    np.multiply(coupling[:, :6], inverse_root, out=columns[:twists].reshape(edges, 6, points))
+    np.multiply(-measurement.prior_information, inverse_root, out=columns[twists])
+    np.multiply(solution.gradient, inverse_root, out=columns[twists + 1])
+    gram = columns @ columns.T
+    np.negative(gram, out=gram)
+    for edge in range(edges):
+        span = slice(6 * edge, 6 * edge + 6)
+        gram[span, span] += blocks[edge, :6, :6]
+        gram[span, -1] += blocks[edge, :6, 6]
+        gram[-1, span] += blocks[edge, :6, 6]
+    scale_gradient = solution.prior_gradient.sum()
+    gram[twists, twists] += measurement.prior_information.sum()
+    gram[twists, -1] -= scale_gradient
+    gram[-1, twists] -= scale_gradient
+    # the true robust cost; never below the quadratic's own constant, because robust losses are concave
+    gram[-1, -1] = 2.0 * solution.cost
+    return gram
+
+
+def _inverse_root(hessian: Array, free: npt.NDArray[np.bool_]) -> Array:
+    return np.sqrt(np.divide(1.0, hessian, out=np.zeros_like(hessian), where=free & (hessian > 1e-12)))
+
+
+def _frozen(array: Array) -> Array:
+    copy = np.array(array, dtype=np.float64, order="C")
+    copy.flags.writeable = False
+    return copy
+
+
+def _check_shapes(measurement: StructurelessMeasurement) -> None:
+    points = len(measurement.rays)
+    edges = len(measurement.weight)
+    expected = {
+        "rays": (points, 3),
+        "initial_log_depth": (points,),
+        "prior_log_depth": (points,),
+        "prior_sigma": (points,),
+        "intrinsics_j": (edges, 4),
+        "target": (edges, points, 2),
+        "weight": (edges, points),
+    }
+    for name, shape in expected.items():
+        actual = np.shape(getattr(measurement, name))
+        if actual != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {actual}")
