@@ -19,7 +19,7 @@ LOG_DEPTH_ZERO = 32768
 DEPTH_ENCODING = "16-bit PNG, depth = exp((value - 32768) / 4096), value 0 = invalid"
 CONFIDENCE_ENCODING = "8-bit PNG, confidence = value / 255"
 
-# Level 1 with run-length strategy: 9 ms for 512x384 noisy depth; level 6 saves 10 % and costs 5 times more.
+# Level 1 with run-length strategy: depth and confidence of a 512x384 frame take 13 ms and about 180 kB.
 _PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 
 

@@ -1,0 +1,142 @@
+"""Every number the software is steered by: one tree of frozen dataclasses, each field with its source.
+
+A field's docstring is its help text (``mvdyn config``) and ends with where its value comes from: "paper"
+is Sun et al., Dense Dynamic Scene Reconstruction and Camera Pose Estimation from Multi-View Videos.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mvdyn_gtsam.config_tree import ConfigKey, build, describe_tree, parse_override, read_file, to_plain
+from mvdyn_gtsam.errors import ConfigError
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise ConfigError with ``message`` unless ``condition``; for ``__post_init__`` of sections."""
+    if not condition:
+        raise ConfigError(message)
+
+
+@dataclass(frozen=True)
+class CaptureConfig:
+    """Reading the input."""
+
+    truncate: bool = False
+    """Cut every camera to the shortest instead of refusing cameras of different length. Source: choice."""
+
+
+@dataclass(frozen=True)
+class FrontendConfig:
+    """Measuring: flow, depth priors, the wide-baseline start."""
+
+    initial_frames: int = 8
+    """Frames per camera used by the wide-baseline start (N_init). Source: paper supplement, parameters."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.initial_frames >= 2,
+            f"frontend.initial_frames is {self.initial_frames}; it must be at least 2",
+        )
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """Connecting: which frames get an edge."""
+
+    spatial_overlap: float = 0.75
+    """Share of the projected grid that must land in the other image for a spatial edge. Source: paper."""
+    temporal_offsets: tuple[int, ...] = (1, 2, 4, 8)
+    """Frame distances of temporal edges, both directions. Source: measured, DESIGN section 5."""
+    max_active_edges: int = 96
+    """Edges kept in the active window; the oldest go first. Source: paper supplement, edge-number ablation."""
+
+    def __post_init__(self) -> None:
+        require(
+            0.0 < self.spatial_overlap <= 1.0,
+            f"graph.spatial_overlap is {self.spatial_overlap}; it must be above 0 and at most 1",
+        )
+        require(
+            len(self.temporal_offsets) > 0 and all(offset >= 1 for offset in self.temporal_offsets),
+            f"graph.temporal_offsets is {list(self.temporal_offsets)}; it must hold frame distances >= 1",
+        )
+        require(self.max_active_edges >= 1, f"graph.max_active_edges is {self.max_active_edges}; at least 1")
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Stage 1: poses and depth scales in a sliding window, then the polish."""
+
+    window: int = 25
+    """Frames in the sliding window, per camera. Source: paper supplement, parameters."""
+    free: int = 10
+    """Latest frames of the window that are optimised. Source: paper supplement, parameters."""
+    depth_prior_lambda: float = 0.005
+    """Weight of the depth prior against the flow. Source: paper supplement, parameters (Eq. 4)."""
+
+    def __post_init__(self) -> None:
+        require(self.window >= 2, f"tracking.window is {self.window}; it must be at least 2")
+        require(
+            1 <= self.free <= self.window,
+            f"tracking.free is {self.free}; it must be between 1 and tracking.window ({self.window})",
+        )
+        require(
+            self.depth_prior_lambda >= 0.0,
+            f"tracking.depth_prior_lambda is {self.depth_prior_lambda}; it must not be negative",
+        )
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Stage 2: dense per-pixel refinement."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """The whole configuration; sections follow the rooms."""
+
+    capture: CaptureConfig = field(default_factory=CaptureConfig)
+    frontend: FrontendConfig = field(default_factory=FrontendConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+
+
+def load_config(file: Path | str | None = None, overrides: Sequence[str] = ()) -> Config:
+    """The defaults, changed by ``file`` (TOML or JSON, sections as tables), changed by ``overrides``.
+
+    An override is ``"section.key=value"`` with the value in TOML syntax, quotes around strings optional.
+    Raises ConfigError, one line, for an unknown key (naming the closest one), a value of the wrong type
+    or out of range, and a file that cannot be read.
+    """
+    values: dict[str, Any] = {} if file is None else read_file(Path(file))
+    # The file alone first, so that its mistakes are reported as the file's.
+    _named(lambda: build(Config, values), str(file))
+    for override in overrides:
+        parse_override(Config, override, values)
+    return _named(lambda: build(Config, values), "--set" if overrides else str(file))
+
+
+def config_from_dict(values: Mapping[str, Any]) -> Config:
+    """The inverse of ``to_dict``; checks as ``load_config`` does."""
+    return build(Config, values)
+
+
+def to_dict(config: Config) -> dict[str, Any]:
+    """``config`` as plain JSON and TOML values: dicts, lists, numbers, strings, booleans."""
+    return to_plain(config)
+
+
+def describe() -> list[ConfigKey]:
+    """Every key with its default and its help text, in order."""
+    return describe_tree(Config())
+
+
+def _named(make: Callable[[], Config], origin: str) -> Config:
+    try:
+        return make()
+    except ConfigError as error:
+        raise ConfigError(f"{origin}: {error}; `mvdyn config` lists every key") from error
