@@ -22,7 +22,7 @@ class BaselineSettings:
     inter_window: int = 5
     """Frame i is matched with frames i-5 .. i+5 of every other camera."""
     pairing: Pairing = "window"
-    """``window`` as in the paper; ``exhaustive``: every image with every other, a control without retrieval."""
+    """``window`` as in the paper; ``exhaustive``: every image with every other, a control."""
     masks: Path | None = None
     """Folder ``<camera>/<%06d>.png`` with 255 where something moves; no features are taken there."""
     num_threads: int = -1

@@ -56,7 +56,9 @@ def write_masks(capture: Capture, moving: Path, folder: Path) -> None:
             if mask is None:
                 raise CaptureError(f"{source}: no readable motion mask; give one per frame or drop the masks")
             if mask.shape != (camera.height, camera.width):
-                raise CaptureError(f"{source}: mask is {mask.shape[::-1]}, frames are {(camera.width, camera.height)}")
+                raise CaptureError(
+                    f"{source}: mask is {mask.shape[::-1]}, frames are {(camera.width, camera.height)}"
+                )
             cv2.imwrite(str(folder / f"{image_name(camera.name, time)}.png"), np.where(mask > 127, 0, 255))
 
 

@@ -1,0 +1,95 @@
+"""Plots of trajectories, of the error over time and of depth errors; needs matplotlib, an extra."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvdyn_gtsam.errors import EvaluationError
+from mvdyn_gtsam.evaluation.association import CameraMatch, PoseSource, ReconstructionLike, associate
+from mvdyn_gtsam.evaluation.depth import frame_depth_error
+from mvdyn_gtsam.evaluation.groundtruth import GroundTruth
+from mvdyn_gtsam.evaluation.trajectory import TrajectoryErrors, trajectory_errors
+
+
+def save_plots(reconstruction: PoseSource, groundtruth: GroundTruth, folder: Path) -> list[Path]:
+    """Write ``trajectories.png`` (X-Y and X-Z, metres) and ``error.png`` (position error over time).
+
+    Raises EvaluationError when matplotlib is missing or the folder cannot be written.
+    """
+    matches = associate(reconstruction, groundtruth)
+    errors = trajectory_errors(matches.values())
+    return [
+        _save(_trajectory_figure(matches, errors), folder / "trajectories.png"),
+        _save(_error_figure(matches, errors), folder / "error.png"),
+    ]
+
+
+def save_depth_plot(
+    reconstruction: ReconstructionLike, groundtruth: GroundTruth, camera: str, time: int, path: Path
+) -> Path:
+    """Write the map of relative depth error of one frame, 0 to 0.25, as an image."""
+    figure, axes = _figure(1, 1, (6.0, 4.5))
+    shown = axes.imshow(
+        frame_depth_error(reconstruction, groundtruth, camera, time), vmin=0.0, vmax=0.25, cmap="magma"
+    )
+    axes.set_title(f"{camera} frame {time}: relative depth error")
+    axes.set_axis_off()
+    figure.colorbar(shown, ax=axes)
+    return _save(figure, path)
+
+
+def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
+    try:
+        # The figure without pyplot: no window system, no global state.
+        figure_module = importlib.import_module("matplotlib.figure")
+    except ImportError as error:
+        raise EvaluationError("plots need matplotlib: pip install mvdyn_gtsam[eval]") from error
+    figure = figure_module.Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns)
+
+
+def _save(figure: Any, path: Path) -> Path:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=120)
+    except OSError as error:
+        raise EvaluationError(f"{path}: plot cannot be written ({error.strerror})") from error
+    return path
+
+
+def _trajectory_figure(matches: Mapping[str, CameraMatch], errors: TrajectoryErrors) -> Any:
+    figure, both = _figure(1, 2, (11.0, 5.0))
+    for axes, (horizontal, vertical) in zip(both, ((0, 1), (0, 2)), strict=True):
+        for index, match in enumerate(matches.values()):
+            color = f"C{index % 10}"
+            true, estimated = match.truth[:, :3, 3], errors.gSe.transform_poses(match.estimated)[:, :3, 3]
+            axes.plot(true[:, horizontal], true[:, vertical], color=color, linestyle=":", linewidth=2)
+            axes.plot(estimated[:, horizontal], estimated[:, vertical], color=color, label=match.camera)
+            axes.plot(*true[:1, [horizontal, vertical]].T, marker="o", color=color)
+        axes.set_xlabel(f"{'xyz'[horizontal]} (m)")
+        axes.set_ylabel(f"{'xyz'[vertical]} (m)")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.grid(alpha=0.3)
+    both[0].legend(title="dotted: true")
+    return figure
+
+
+def _error_figure(matches: Mapping[str, CameraMatch], errors: TrajectoryErrors) -> Any:
+    figure, axes = _figure(1, 1, (9.0, 4.0))
+    for index, match in enumerate(matches.values()):
+        axes.plot(
+            match.timestamps, errors.position_m[match.camera], color=f"C{index % 10}", label=match.camera
+        )
+        missing = match.timestamps[np.isnan(errors.position_m[match.camera])]
+        axes.plot(missing, np.zeros(len(missing)), "x", color=f"C{index % 10}")
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("position error (m)")
+    axes.set_title(f"ATE {errors.ate_m:.4f} m; a cross marks a frame without a pose")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return figure

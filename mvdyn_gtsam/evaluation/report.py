@@ -1,0 +1,71 @@
+"""Scores as a table for people."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from mvdyn_gtsam.evaluation.scores import CameraScores, Scores
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A figure, or a dash where there is none."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def format_table(scores: Scores) -> Table:
+    """One row per camera and one for all together; the caption holds what has no row."""
+    table = Table(
+        title="Reconstruction against ground truth", caption="\n".join(_notes(scores)), caption_justify="left"
+    )
+    for name in ("camera", "poses %", "ATE m", "RTE m", "RRE deg", "Abs.Rel", "d<1.25", "M_d m"):
+        table.add_column(name, justify="left" if name == "camera" else "right", no_wrap=True)
+    rows: list[tuple[str, CameraScores | Scores]] = [*scores.per_camera.items(), ("all", scores)]
+    for name, row in rows:
+        if name == "all":
+            table.add_section()
+        depth = row.depth
+        table.add_row(
+            name,
+            f"{100 * row.registered:.1f}",
+            number(row.ate_m),
+            number(row.rte_m),
+            number(row.rre_deg, 3),
+            number(depth.abs_rel if depth else None),
+            number(depth.delta_1_25 if depth else None, 3),
+            number(depth.m_d if depth else None),
+            style="bold" if name == "all" else None,
+        )
+    return table
+
+
+def _notes(scores: Scores) -> list[str]:
+    notes = ["One Sim(3) over all cameras; RMSE. Abs.Rel and d<1.25 after one scale and offset per frame."]
+    if not scores.complete:
+        missing = scores.frames - round(scores.registered * scores.frames)
+        notes.append(
+            f"INCOMPLETE: {missing} of {scores.frames} frames have no pose; the errors leave these out."
+        )
+    if scores.inter_camera_rot_deg is not None:
+        notes.append(
+            f"Between cameras: {number(scores.inter_camera_trans_m)} m,"
+            f" {number(scores.inter_camera_rot_deg, 3)} deg;"
+            f" at the start {number(scores.inter_camera_start_trans_m)} m,"
+            f" {number(scores.inter_camera_start_rot_deg, 3)} deg."
+            f" Median true depth {number(scores.median_depth_m, 2)} m."
+        )
+    depth = scores.depth
+    if depth is not None and depth.frames_without_estimate:
+        notes.append(
+            f"No depth for {depth.frames_without_estimate} of {depth.frames} frames with true depth."
+        )
+    if depth is not None and depth.m_d_scale_only is not None:
+        notes.append(f"M_d after the full Sim(3); with the scale alone {number(depth.m_d_scale_only)} m.")
+    if depth is not None and depth.abs_rel_moving is not None:
+        notes.append(
+            f"Abs.Rel of static pixels {number(depth.abs_rel_static)}, moving {number(depth.abs_rel_moving)}."
+        )
+    if len(scores.groups) > 1:
+        for group in scores.groups:
+            figures = group.problem or f"ATE {number(group.ate_m)} m, RRE {number(group.rre_deg, 3)} deg"
+            notes.append(f"Group {', '.join(group.cameras)} alone: {figures}")
+    return notes
