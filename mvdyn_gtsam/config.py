@@ -52,7 +52,7 @@ class GraphConfig:
     temporal_offsets: tuple[int, ...] = (1, 2, 4, 8)
     """Frame distances of temporal edges, both directions. Source: measured, DESIGN section 5."""
     max_active_edges: int = 96
-    """Edges kept in the active window; the oldest go first. Source: paper supplement, edge-number ablation."""
+    """Edges kept in the active window; the oldest go first. Source: paper supplement, edge ablation."""
 
     def __post_init__(self) -> None:
         require(
