@@ -1,0 +1,28 @@
+"""IN: cameras, lazily decoded streams, dataset readers, and the checks made when they are loaded."""
+
+from mvdyn_gtsam.capture.convert import write_capture
+from mvdyn_gtsam.capture.dispatch import open_capture
+from mvdyn_gtsam.capture.euroc import load_euroc
+from mvdyn_gtsam.capture.folder_per_camera import load_folder_per_camera
+from mvdyn_gtsam.capture.loader import capture_from_cameras, load_capture
+from mvdyn_gtsam.capture.model import Camera, Capture, FrameStream
+from mvdyn_gtsam.capture.multicamvideo import convert_multicamvideo, load_multicamvideo, multicamvideo_poses
+from mvdyn_gtsam.capture.streams import ImageStream, UndistortedStream, VideoStream
+
+__all__ = [
+    "Camera",
+    "Capture",
+    "FrameStream",
+    "ImageStream",
+    "UndistortedStream",
+    "VideoStream",
+    "capture_from_cameras",
+    "convert_multicamvideo",
+    "load_capture",
+    "load_euroc",
+    "load_folder_per_camera",
+    "load_multicamvideo",
+    "multicamvideo_poses",
+    "open_capture",
+    "write_capture",
+]

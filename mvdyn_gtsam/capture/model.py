@@ -49,6 +49,8 @@ class Capture:
     fps: float
     cameras: tuple[Camera, ...]
     streams: tuple[FrameStream, ...]
+    start_time: float = 0.0
+    """Seconds on the common clock of frame 0; not zero only where time offsets trimmed the start."""
 
     @property
     def frame_count(self) -> int:
@@ -58,7 +60,7 @@ class Capture:
     @property
     def timestamps(self) -> npt.NDArray[np.float64]:
         """``(T,)`` seconds on the common clock."""
-        return np.arange(self.frame_count) / self.fps
+        return self.start_time + np.arange(self.frame_count) / self.fps
 
     def read(self, camera: int, time: int) -> npt.NDArray[np.uint8]:
         """Frame ``time`` of camera number ``camera`` as ``(H, W, 3) uint8`` RGB, undistorted."""
