@@ -22,10 +22,12 @@ def gram_matrix(jacobian: Array, residual: Array) -> Array:
 
 
 def compress_gram(gram: Array) -> Array:
-    """Upper-triangular ``root (n, n)`` with ``root.T @ root == gram`` for a positive semidefinite ``gram (n, n)``.
+    """Upper-triangular ``root (n, n)`` with ``root.T @ root == gram`` for a positive semidefinite ``gram (n,
+    n)``.
 
-    Rank-deficient input is allowed: columns are scaled to unit diagonal, ``RELATIVE_JITTER`` is added, and should
-    Cholesky still fail (rounding made the matrix slightly indefinite) negative eigenvalues are clipped.
+    Rank-deficient input is allowed: columns are scaled to unit diagonal, ``RELATIVE_JITTER`` is added, and
+    should Cholesky still fail (rounding made the matrix slightly indefinite) negative eigenvalues are
+    clipped.
     """
     scale = np.sqrt(np.maximum(np.diagonal(gram), 0.0))
     used = scale > 0.0
@@ -34,7 +36,7 @@ def compress_gram(gram: Array) -> Array:
     scaled *= inverse_scale[:, None]
     np.fill_diagonal(scaled, 1.0 + RELATIVE_JITTER)
     try:
-        root = np.linalg.cholesky(scaled).T
+        root: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
     except np.linalg.LinAlgError:
         root = _clipped_root(scaled)
     return root * scale
@@ -49,8 +51,8 @@ def compress(jacobian: Array, residual: Array) -> tuple[Array, Array]:
 def rotate_residual_to_last(root: Array) -> Array:
     """Rotate rows so that the last column is ``[0, ..., 0, norm]``; same Gram matrix, ``root (n, n)``.
 
-    One Householder reflection. It makes the error vector of a compressed factor the same function of the cost alone
-    whether or not Jacobians are asked for.
+    One Householder reflection. It makes the error vector of a compressed factor the same function of the cost
+    alone whether or not Jacobians are asked for.
     """
     residual = root[:, -1]
     above = float(residual[:-1] @ residual[:-1])
@@ -69,4 +71,4 @@ def rotate_residual_to_last(root: Array) -> Array:
 def _clipped_root(matrix: Array) -> Array:
     eigenvalues, eigenvectors = np.linalg.eigh(matrix)
     root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * eigenvectors.T
-    return np.linalg.qr(root, mode="r")
+    return np.asarray(np.linalg.qr(root, mode="r"), dtype=np.float64)

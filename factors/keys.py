@@ -1,7 +1,7 @@
 """Variable keys of the graph: the pose ``X`` and the log depth scale ``S`` of a (camera, time) frame.
 
-A key packs ``character (8 bits) | camera (16 bits) | time (40 bits)`` into one integer, so sorting keys sorts by
-kind, camera and time. ``gtsam.DefaultKeyFormatter`` prints the character and one number; use ``key_name``.
+A key packs ``character (8 bits) | camera (16 bits) | time (40 bits)`` into one integer, so sorting keys sorts
+by kind, camera and time. ``gtsam.DefaultKeyFormatter`` prints the character and one number; use ``key_name``.
 ``X`` holds a ``gtsam.Pose3`` (wTc), ``S`` a plain double (``values.insert(S(c, t), 0.0)``, ``atDouble``).
 """
 

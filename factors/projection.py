@@ -1,7 +1,7 @@
 """Reprojection of grid points from one frame into others, with analytic Jacobians; numpy only.
 
-``u_ij = pi(K_j, jTi * z_i * ray_i)`` with ``z_i = exp(log_depth)``. Poses are ``wTc`` matrices; Jacobians are for
-right perturbations ``wTc * Exp([omega, v])``, the retraction of ``gtsam.Pose3``.
+``u_ij = pi(K_j, jTi * z_i * ray_i)`` with ``z_i = exp(log_depth)``. Poses are ``wTc`` matrices; Jacobians are
+for right perturbations ``wTc * Exp([omega, v])``, the retraction of ``gtsam.Pose3``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 MINIMUM_DEPTH_RATIO = 0.01
-"""A point counts as seen in j when its z-depth there exceeds this fraction of its z-depth in i (unit-free)."""
+"""A point counts as seen in j when its z-depth there exceeds this fraction of its z-depth in i
+(unit-free)."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ def relative_poses(wTi: Array, wTj: Array) -> Array:
 
 
 def adjoint(aTb: Array) -> Array:
-    """Adjoint ``(E, 6, 6)`` of ``aTb (E, 4, 4)`` for tangents ``[omega, v]``: ``aTb Exp(x) = Exp(Ad x) aTb``."""
+    """Adjoint ``(E, 6, 6)`` of ``aTb (E, 4, 4)`` for tangents ``[omega, v]``: ``aTb Exp(x) = Exp(Ad x)
+    aTb``."""
     result = np.zeros((len(aTb), 6, 6))
     aRb = aTb[:, :3, :3]
     result[:, :3, :3] = aRb
@@ -87,8 +89,8 @@ def intrinsics_vectors(intrinsics: Array) -> Array:
 def reproject(rays: Array, log_depth: Array, wTi: Array, wTj: Array, intrinsics_j: Array) -> Reprojection:
     """Pixels in frames j of grid points of frame i.
 
-    ``rays (N, 3)`` with z = 1, ``log_depth (N,)``, ``wTi (4, 4)``, ``wTj (E, 4, 4)``, ``intrinsics_j`` ``(E, 4)`` as
-    fx fy cx cy or ``(E, 3, 3)``.
+    ``rays (N, 3)`` with z = 1, ``log_depth (N,)``, ``wTi (4, 4)``, ``wTj (E, 4, 4)``, ``intrinsics_j`` ``(E,
+    4)`` as fx fy cx cy or ``(E, 3, 3)``.
     """
     return _reproject_points(rays, log_depth, relative_poses(wTi, wTj), intrinsics_vectors(intrinsics_j))[0]
 

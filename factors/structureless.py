@@ -1,19 +1,19 @@
 """Flow of one keyframe to its neighbours with every grid point's log depth eliminated inside the factor.
 
-Unknowns of keyframe i: its pose, the poses of E neighbours j, a log depth scale S_i and, per grid point k, the log
-depth l_k. Cost, in the metric ``1/2 ||.||^2``::
+Unknowns of keyframe i: its pose, the poses of E neighbours j, a log depth scale S_i and, per grid point k,
+the log depth l_k. Cost, in the metric ``1/2 ||.||^2``::
 
     sum_e,k  weight_ek / noise_px^2 * rho(||pi(K_j, jTi exp(l_k) ray_k) - target_ek||)
   + sum_k    1/2 ((l_k - S_i - prior_log_depth_k) / prior_sigma_k)^2
 
-At every evaluation the l_k are minimised over at the given poses by a fixed number of damped Gauss-Newton steps from
-the stored start (no state is kept), and the Gauss-Newton system in the poses is what remains after eliminating them:
-one scalar Schur complement per point, cf. "smart factors" (Carlone et al., ICRA 2014) and the point elimination of
-bundle adjustment (Triggs et al., 2000).
+At every evaluation the l_k are minimised over at the given poses by a fixed number of damped Gauss-Newton
+steps from the stored start (no state is kept), and the Gauss-Newton system in the poses is what remains after
+eliminating them: one scalar Schur complement per point, cf. "smart factors" (Carlone et al., ICRA 2014) and
+the point elimination of bundle adjustment (Triggs et al., 2000).
 
-The factor returns the system in square-root form of 6 E + 2 rows. Its error vector is ``[0, ..., 0, sqrt(2 cost)]`` with
-and without Jacobians, so ``error()`` is exactly the robust cost, and ``J^T e`` is exactly the gradient of the
-re-weighted system; Levenberg-Marquardt therefore accepts or rejects by the true robust cost.
+The factor returns the system in square-root form of 6 E + 2 rows. Its error vector is ``[0, ..., 0, sqrt(2
+cost)]`` with and without Jacobians, so ``error()`` is exactly the robust cost, and ``J^T e`` is exactly the
+gradient of the re-weighted system; Levenberg-Marquardt therefore accepts or rejects by the true robust cost.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ import numpy as np
 import numpy.typing as npt
 
 from factors.compression import compress_gram, rotate_residual_to_last
-from factors.flow_terms import EdgeRays, FlowTerms, edge_rays, flow_terms, weighted_rows
+from factors.flow_terms import FlowTerms, edge_rays, flow_terms, read_only_copy, weighted_rows
 from factors.projection import adjoint, relative_poses
 from factors.robust import Loss, LossName, make_loss
 
 Array = npt.NDArray[np.float64]
 
 LOG_DEPTH_RANGE = 4.0
-"""A log depth stays within this of its start (a factor of 55); a point at the limit counts as known, not as free."""
+"""A log depth stays within this of its start (a factor of 55); a point at the limit counts as known, not as
+free."""
 MAXIMUM_STEP = 0.7
 """Longest single log-depth step (a factor of 2)."""
 
@@ -42,8 +43,8 @@ MAXIMUM_STEP = 0.7
 class StructurelessMeasurement:
     """Dense flow of the N grid points of keyframe i to E frames; arrays are copied and made read-only.
 
-    Raises ValueError when shapes disagree, a depth start is not finite or a weight is negative. NaN targets or weights
-    count as no measurement, a NaN prior log depth or an infinite sigma as no prior.
+    Raises ValueError when shapes disagree, a depth start is not finite or a weight is negative. NaN targets
+    or weights count as no measurement, a NaN prior log depth or an infinite sigma as no prior.
     """
 
     rays: Array
@@ -108,7 +109,7 @@ class StructurelessMeasurement:
             "information": weight / self.noise_px**2,
         }
         for name, array in arrays.items():
-            object.__setattr__(self, name, _frozen(array))
+            object.__setattr__(self, name, read_only_copy(array))
         object.__setattr__(self, "rays", self.planar_rays.T)
         # a view: the planar copy is the only one kept
         object.__setattr__(self, "target", np.moveaxis(self.planar_target, 0, 2))
@@ -122,7 +123,8 @@ class EdgeResiduals:
     count: npt.NDArray[np.int64]
     """``(E,)`` points with a measurement."""
     rms_px: Array
-    """``(E,)`` root mean square residual weighted by measurement weight, behind-camera points left out; NaN if none."""
+    """``(E,)`` root mean square residual weighted by measurement weight, behind-camera points left out; NaN
+    if none."""
     median_px: Array
     """``(E,)`` median residual of the measured points; NaN if none."""
     inlier_fraction: Array
@@ -141,16 +143,15 @@ class _Solution:
     gradient: Array
     hessian: Array
     prior_gradient: Array
-    depth: Array
     jTi: Array
-    rays: EdgeRays
     terms: FlowTerms
 
 
 def evaluate(
     measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float
 ) -> tuple[float, Array]:
-    """Robust cost and the solved log depths ``(N,)`` at ``wTi (4, 4)``, ``wTj (E, 4, 4)`` and ``log_scale``."""
+    """Robust cost and the solved log depths ``(N,)`` at ``wTi (4, 4)``, ``wTj (E, 4, 4)`` and
+    ``log_scale``."""
     solution = _solve(measurement, wTi, wTj, log_scale)
     return solution.cost, solution.log_depth
 
@@ -158,7 +159,8 @@ def evaluate(
 def solve_log_depths(
     measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float
 ) -> tuple[Array, Array]:
-    """Log depths ``(N,)`` at given poses and their information ``(N,)`` (inverse variance, poses held fixed)."""
+    """Log depths ``(N,)`` at given poses and their information ``(N,)`` (inverse variance, poses held
+    fixed)."""
     solution = _solve(measurement, wTi, wTj, log_scale)
     return solution.log_depth, solution.hessian
 
@@ -215,15 +217,17 @@ def structureless_flow_factor(
 ) -> gtsam.CustomFactor:
     """The factor over ``[X_i, X_j1, ..., X_jE, S_i]``; poses are ``Pose3``, the scale is a double.
 
-    With ``scale_key=None`` the scale is no variable but fixed at ``log_scale``. Raises ValueError when the number of
-    keys does not match the measurement or a pose appears twice.
+    With ``scale_key=None`` the scale is no variable but fixed at ``log_scale``. Raises ValueError when the
+    number of keys does not match the measurement or a pose appears twice.
     """
     edges = len(measurement.weight)
     if len(pose_j_keys) != edges:
         raise ValueError(f"measurement has {edges} edges but {len(pose_j_keys)} neighbour keys were given")
     keys = [pose_i_key, *pose_j_keys] + ([] if scale_key is None else [scale_key])
     if len(set(keys)) != len(keys):
-        raise ValueError("every key of a structureless factor must be different: merge edges to the same frame")
+        raise ValueError(
+            "every key of a structureless factor must be different: merge edges to the same frame"
+        )
     error = partial(_factor_error, measurement, scale_key is not None, log_scale)
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6 * edges + 2), keys, error)
 
@@ -259,33 +263,26 @@ def _solve(measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_sc
     jTi = relative_poses(wTi, wTj)
     rays = edge_rays(measurement.planar_rays, jTi, measurement.intrinsics_j)
     mean = measurement.prior_log_depth + log_scale
-    prior_information = measurement.prior_information
+    kernel = measurement.kernel
     lower = measurement.initial_log_depth - LOG_DEPTH_RANGE
     upper = measurement.initial_log_depth + LOG_DEPTH_RANGE
 
-    def at(log_depth: Array) -> tuple[FlowTerms, Array, Array, Array]:
-        terms = flow_terms(
-            rays, np.exp(log_depth), measurement.planar_target, measurement.information, measurement.kernel
+    terms = FlowTerms.empty(*measurement.weight.shape)
+
+    def at(log_depth: Array) -> tuple[Array, Array, Array]:
+        flow_terms(
+            rays, np.exp(log_depth), measurement.planar_target, measurement.information, kernel, out=terms
         )
-        offset = log_depth - mean
-        prior_gradient = prior_information * offset
-        cost = (measurement.kernel.cost(terms.squared_norm) * measurement.information).sum(axis=0)
-        cost += 0.5 * prior_gradient * offset
-        slope, residual = terms.by_log_depth, terms.residual
-        gradient = ((slope[0] * residual[0] + slope[1] * residual[1]) * terms.weight).sum(axis=0)
-        gradient += prior_gradient
-        hessian = ((slope[0] * slope[0] + slope[1] * slope[1]) * terms.weight).sum(axis=0)
-        hessian += prior_information
-        return terms, cost, gradient, hessian
+        return _point_sums(measurement, terms, log_depth - mean)
 
     log_depth = measurement.initial_log_depth
-    terms, cost, gradient, hessian = at(log_depth)
+    cost, gradient, hessian = at(log_depth)
     damping = np.full(len(log_depth), 1e-4)
     current = True
     for _ in range(measurement.steps):
         step = -gradient / (hessian * (1.0 + damping) + 1e-12)
         candidate = np.clip(log_depth + np.clip(step, -MAXIMUM_STEP, MAXIMUM_STEP), lower, upper)
-        terms, new_cost, new_gradient, new_hessian = at(candidate)
+        new_cost, new_gradient, new_hessian = at(candidate)
         # the margin keeps rounding at convergence from being taken for a failed step
         better = new_cost <= cost * (1.0 + 1e-12)
         current = bool(better.all())
@@ -298,34 +295,64 @@ def _solve(measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_sc
             hessian = np.where(better, new_hessian, hessian)
         damping = np.where(better, damping * 0.1, damping * 100.0)
     if not current:
-        terms, cost, gradient, hessian = at(log_depth)
+        cost, gradient, hessian = at(log_depth)
     return _Solution(
         cost=float(cost.sum()),
         log_depth=log_depth,
         free=(log_depth > lower) & (log_depth < upper),
         gradient=gradient,
         hessian=hessian,
-        prior_gradient=prior_information * (log_depth - mean),
-        depth=np.exp(log_depth),
+        prior_gradient=measurement.prior_information * (log_depth - mean),
         jTi=jTi,
-        rays=rays,
         terms=terms,
     )
 
 
+def _point_sums(
+    measurement: StructurelessMeasurement, terms: FlowTerms, prior_offset: Array
+) -> tuple[Array, Array, Array]:
+    """Cost, gradient and Gauss-Newton Hessian ``(N,)`` of each log depth; overwrites ``terms.scratch``."""
+    prior_gradient = measurement.prior_information * prior_offset
+    edge_cost = measurement.kernel.cost(terms.squared_norm)
+    edge_cost *= measurement.information
+    cost = edge_cost.sum(axis=0)
+    cost += 0.5 * prior_gradient * prior_offset
+    scratch = terms.scratch
+    by_row = scratch.reshape(-1, len(prior_offset))
+    np.multiply(terms.by_log_depth, terms.residual, out=scratch)
+    scratch *= terms.weight
+    gradient = by_row.sum(axis=0)
+    gradient += prior_gradient
+    np.multiply(terms.by_log_depth, terms.by_log_depth, out=scratch)
+    scratch *= terms.weight
+    hessian = by_row.sum(axis=0)
+    hessian += measurement.prior_information
+    return cost, gradient, hessian
+
+
 def _reduced_gram(measurement: StructurelessMeasurement, solution: _Solution) -> Array:
-    """Gram matrix ``(6 E + 2, 6 E + 2)`` over ``[twists of jTi | log scale | residual]``, log depths eliminated."""
-    rows, by_log_depth = weighted_rows(solution.rays, solution.terms, solution.depth, measurement.intrinsics_j)
-    edges, points = solution.terms.weight.shape
+    """Gram matrix ``(6 E + 2, 6 E + 2)`` over ``[twists of jTi | log scale | residual]``, log depths
+    eliminated."""
+    terms = solution.terms
+    edges, points = terms.weight.shape
     twists = 6 * edges
-    flat = rows.reshape(edges, 7, 2 * points)
-    blocks = flat @ flat.swapaxes(1, 2)
-    coupling = rows[:, :, 0] * by_log_depth[0][:, None]
-    coupling += rows[:, :, 1] * by_log_depth[1][:, None]
+    inverse_root = _inverse_root(solution.hessian, solution.free)
+    blocks = np.empty((edges, 7, 7))
     # per point: derivative of the log-depth gradient by [twists | log scale], and that gradient itself
     columns = np.empty((twists + 2, points))
-    inverse_root = _inverse_root(solution.hessian, solution.free)
-    np.multiply(coupling[:, :6], inverse_root, out=columns[:twists].reshape(edges, 6, points))
+    rows = np.empty((7, 2, points))
+    for edge in range(edges):
+        root_weight = weighted_rows(
+            terms, edge, measurement.planar_target[:, edge], measurement.intrinsics_j[edge], out=rows
+        )
+        flat = rows.reshape(7, 2 * points)
+        np.matmul(flat, flat.T, out=blocks[edge])
+        root_weight *= inverse_root
+        slope = terms.by_log_depth[:, edge] * root_weight
+        coupling = columns[6 * edge : 6 * edge + 6]
+        np.multiply(rows[:6, 0], slope[0], out=coupling)
+        rows[:6, 1] *= slope[1]
+        coupling += rows[:6, 1]
     np.multiply(-measurement.prior_information, inverse_root, out=columns[twists])
     np.multiply(solution.gradient, inverse_root, out=columns[twists + 1])
     gram = columns @ columns.T
@@ -346,12 +373,6 @@ def _reduced_gram(measurement: StructurelessMeasurement, solution: _Solution) ->
 
 def _inverse_root(hessian: Array, free: npt.NDArray[np.bool_]) -> Array:
     return np.sqrt(np.divide(1.0, hessian, out=np.zeros_like(hessian), where=free & (hessian > 1e-12)))
-
-
-def _frozen(array: Array) -> Array:
-    copy = np.array(array, dtype=np.float64, order="C")
-    copy.flags.writeable = False
-    return copy
 
 
 def _check_shapes(measurement: StructurelessMeasurement) -> None:
