@@ -33,8 +33,8 @@ def align(gTc: Array, eTc: Array) -> Similarity:
     """``gSe`` that brings estimated poses ``(N, 4, 4)`` of all cameras together onto the true ones.
 
     Umeyama on the positions (https://doi.org/10.1109/34.88573) as evo does it. Where all positions lie on a
-    line the turn about that line is not theirs to tell, and is taken from the orientations; the position error
-    is the same for every such turn. Raises EvaluationError when the positions coincide.
+    line the turn about that line is not theirs to tell, and is taken from the orientations; the position
+    error is the same for every such turn. Raises EvaluationError when the positions coincide.
     """
     trajectory = evo_module("core.trajectory")
     if len(gTc) == 0:

@@ -56,7 +56,7 @@ class DepthScores:
     m_d: float | None
     """Median distance in metres of corresponding points in the world, after the trajectory's full Sim(3)."""
     m_d_scale_only: float | None
-    """The same in each camera's own frame: estimated depth times the Sim(3)'s scale; its pose plays no part."""
+    """The same in each camera's own frame: the depth takes the Sim(3)'s scale, its pose plays no part."""
     frames: int
     """Frames with a true depth image."""
     frames_without_estimate: int
@@ -130,12 +130,14 @@ def depth_scores(
 
 
 def median_true_depth(groundtruth: GroundTruth) -> float | None:
-    """Median in metres over all true depth images, thinned to every 7th pixel; None without any."""
-    values = [
-        depth[np.isfinite(depth)]
-        for camera in groundtruth.cameras
-        for depth in (groundtruth.depth(camera, time)[::7, ::7] for time in groundtruth.depth_frames(camera))
-    ]
+    """Median in metres over all true depth images; None without any."""
+    wanted = [(camera, time) for camera in groundtruth.cameras for time in groundtruth.depth_frames(camera)]
+    budget = max(1000, MAX_DISTANCES // max(1, len(wanted)))
+    values = []
+    for camera, time in wanted:
+        depth = groundtruth.depth(camera, time)
+        depth = depth[np.isfinite(depth)]
+        values.append(depth[:: max(1, -(-len(depth) // budget))])
     return _median(values)
 
 
