@@ -1,4 +1,4 @@
-"""The bundled clip of ``mvdyn demo``: two hand-held cameras, a walking robot dog, exact ground truth (rendered)."""
+"""The bundled clip of ``mvdyn demo``: two hand-held cameras, a robot dog, exact ground truth (rendered)."""
 
 from __future__ import annotations
 
