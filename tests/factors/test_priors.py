@@ -44,9 +44,9 @@ def test_constant_velocity_jacobians_are_numerical_ones(seed: int) -> None:
 
     def error(delta: np.ndarray) -> np.ndarray:
         moved = [pose.retract(delta[6 * k : 6 * k + 6]) for k, pose in enumerate(poses)]
-        return constant_velocity_error(*moved, 0.7, 1.6)[0]
+        return constant_velocity_error(moved[0], moved[1], moved[2], 0.7, 1.6)[0]
 
-    _, derivatives = constant_velocity_error(*poses, 0.7, 1.6)
+    _, derivatives = constant_velocity_error(poses[0], poses[1], poses[2], 0.7, 1.6)
     np.testing.assert_allclose(np.hstack(derivatives), numerical_jacobian(error, 18), rtol=1e-5, atol=1e-7)
 
 
