@@ -7,8 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from mvdyn_gtsam.errors import BaselineError
+
 Method = Literal["colmap", "glomap"]
 METHODS: tuple[Method, ...] = ("colmap", "glomap")
+
+RESULT_NAME = "baseline.json"
+"""What the worker leaves in its folder besides the reconstruction: seconds per phase, number of points."""
 
 Pairing = Literal["window", "exhaustive"]
 
@@ -39,3 +44,39 @@ class BaselineSettings:
     def from_json(values: dict[str, Any]) -> BaselineSettings:
         masks = values.get("masks")
         return BaselineSettings(**{**values, "masks": None if masks is None else Path(masks)})
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the worker process is asked for."""
+
+    capture: Path
+    method: Method
+    out: Path
+    settings: BaselineSettings
+    database: Path | None = None
+    """Folder that keeps frames, features and matches, so that a second method can start from them."""
+    truncate: bool = False
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "capture": str(self.capture),
+            "method": self.method,
+            "out": str(self.out),
+            "settings": self.settings.to_json(),
+            "database": None if self.database is None else str(self.database),
+            "truncate": self.truncate,
+        }
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> Request:
+        if values["method"] not in METHODS:
+            raise BaselineError(f"method {values['method']!r} is none of {', '.join(METHODS)}")
+        return Request(
+            capture=Path(values["capture"]),
+            method=values["method"],
+            out=Path(values["out"]),
+            settings=BaselineSettings.from_json(values["settings"]),
+            database=None if values["database"] is None else Path(values["database"]),
+            truncate=bool(values["truncate"]),
+        )

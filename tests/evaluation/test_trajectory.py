@@ -15,6 +15,7 @@ from mvdyn_gtsam.evaluation.alignment import align
 from mvdyn_gtsam.evaluation.association import associate
 from mvdyn_gtsam.evaluation.groundtruth import GroundTruth
 from mvdyn_gtsam.evaluation.scores import Scores, evaluate, evaluate_poses
+from mvdyn_gtsam.evaluation.trajectory import trajectory_errors
 from mvdyn_gtsam.geometry import Similarity
 from tests.evaluation.fakes import FakeReconstruction, perturbed, random_poses, random_similarity
 
@@ -158,8 +159,6 @@ def test_missing_frames_are_counted_and_not_bridged() -> None:
     assert reference.has_estimate.sum() == 11
     steps = {c: len(p) - 1 for c, p in truth.items()}
     steps["cam0"] -= 2
-    from mvdyn_gtsam.evaluation.trajectory import trajectory_errors
-
     errors = trajectory_errors(associate(FakeReconstruction(estimate), truth_of(truth)).values())
     assert {c: len(e) for c, e in errors.relative_translation_m.items()} == steps
 

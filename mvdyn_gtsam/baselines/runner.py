@@ -1,0 +1,105 @@
+"""Run COLMAP or GLOMAP on a capture, in a process of its own, and read the result back."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
+from mvdyn_gtsam.baselines.settings import METHODS, RESULT_NAME, BaselineSettings, Method, Request
+from mvdyn_gtsam.errors import BaselineError
+from mvdyn_gtsam.reconstruction import Reconstruction
+
+
+@dataclass(frozen=True)
+class BaselineResult:
+    """A finished baseline run; ``folder`` is a reconstruction folder without depth."""
+
+    method: Method
+    folder: Path
+    trajectories: Mapping[str, npt.NDArray[np.float64]]
+    """Camera -> ``wTc`` ``(T, 4, 4)``, NaN for frames outside the largest model."""
+    registered: float
+    """Fraction of all frames with a pose."""
+    phases: Mapping[str, float]
+    """Seconds of ``frames``, ``features``, ``matching`` and ``mapping``."""
+    seconds: float
+    """The whole process, plus the phases taken over from another method's run."""
+    peak_mb: float
+    points: int
+    """Sparse points of the model."""
+
+
+def run_baseline(
+    capture: Path,
+    method: Method,
+    out: Path,
+    *,
+    settings: BaselineSettings | None = None,
+    database: Path | None = None,
+    truncate: bool = False,
+    timeout_s: float | None = None,
+) -> BaselineResult:
+    """Reconstruct the capture folder with COLMAP (incremental) or GLOMAP (global mapping).
+
+    ``database`` names a folder where frames, features and matches are kept: the second method given the same
+    folder starts from them, and their time counts for both. The log is ``<out>.log``. Raises BaselineError,
+    with the reason in one line, when the method fails or finds no model; ResultError when ``out`` is in use.
+    """
+    if method not in METHODS:
+        raise BaselineError(f"method {method!r} is none of {', '.join(METHODS)}")
+    usage = run_worker(capture, method, out, settings, database, truncate, timeout_s)
+    if usage.problem is not None:
+        raise BaselineError(f"{method}: {usage.problem}")
+    return read_result(method, out, usage)
+
+
+def run_worker(
+    capture: Path,
+    method: Method,
+    out: Path,
+    settings: BaselineSettings | None = None,
+    database: Path | None = None,
+    truncate: bool = False,
+    timeout_s: float | None = None,
+) -> ProcessUsage:
+    """As :func:`run_baseline`, but a failure is told in the usage and the result is left on disk."""
+    # Not inside `out`: the worker accepts an empty folder or a reconstruction, nothing else.
+    request_path = out.with_name(f"{out.name}.request.json")
+    request = Request(capture, method, out, settings or BaselineSettings(), database, truncate)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        request_path.write_text(json.dumps(request.to_json()))
+    except OSError as error:
+        raise BaselineError(f"{request_path}: cannot be written ({error.strerror})") from error
+    command = [sys.executable, "-m", "mvdyn_gtsam.baselines.worker", str(request_path)]
+    usage = run_measured(command, out.with_name(f"{out.name}.log"), timeout_s=timeout_s)
+    request_path.unlink()
+    return usage
+
+
+def read_result(method: Method, out: Path, usage: ProcessUsage) -> BaselineResult:
+    """Read back what the worker wrote. Raises BaselineError when it is not there."""
+    try:
+        content = json.loads((out / RESULT_NAME).read_text())
+    except (OSError, ValueError) as error:
+        raise BaselineError(f"{out / RESULT_NAME}: cannot be read ({error})") from error
+    reconstruction = Reconstruction.load(out)
+    trajectories = {camera: reconstruction.trajectory(camera)[1] for camera in reconstruction.cameras}
+    found = np.concatenate([np.isfinite(wTc).all(axis=(1, 2)) for wTc in trajectories.values()])
+    return BaselineResult(
+        method=method,
+        folder=out,
+        trajectories=trajectories,
+        registered=float(found.mean()),
+        phases=content["phases"],
+        seconds=usage.seconds + sum(content["reused"].values()),
+        peak_mb=usage.peak_mb if usage.peak_mb is not None else float("nan"),
+        points=int(content["points"]),
+    )

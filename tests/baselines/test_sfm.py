@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mvdyn_gtsam.baselines import sfm
+from mvdyn_gtsam.baselines.settings import BaselineSettings
+from mvdyn_gtsam.errors import BaselineError
+
+
+def test_pairs_are_those_of_the_paper() -> None:
+    pairs = sfm.pairs_to_match(["a", "b"], 30, BaselineSettings())
+    assert len(pairs) == len({frozenset(pair) for pair in pairs})
+    partners: dict[str, set[str]] = {}
+    for first, second in pairs:
+        partners.setdefault(first, set()).add(second)
+        partners.setdefault(second, set()).add(first)
+    own = {sfm.image_name("a", time) for time in range(5, 26) if time != 15}
+    other = {sfm.image_name("b", time) for time in range(10, 21)}
+    assert partners[sfm.image_name("a", 15)] == own | other
+    assert sfm.image_name("a", 10) in partners[sfm.image_name("a", 0)]
+    assert sfm.image_name("a", 11) not in partners[sfm.image_name("a", 0)]
+
+
+def test_windows_can_be_closed() -> None:
+    settings = BaselineSettings(intra_window=1, inter_window=0)
+    assert sfm.pairs_to_match(["a", "b", "c"], 2, settings) == [
+        ("a/000000.png", "a/000001.png"),
+        ("b/000000.png", "b/000001.png"),
+        ("c/000000.png", "c/000001.png"),
+        ("a/000000.png", "b/000000.png"),
+        ("a/000001.png", "b/000001.png"),
+        ("a/000000.png", "c/000000.png"),
+        ("a/000001.png", "c/000001.png"),
+        ("b/000000.png", "c/000000.png"),
+        ("b/000001.png", "c/000001.png"),
+    ]
+
+
+def test_exhaustive_pairs_are_all() -> None:
+    assert len(sfm.pairs_to_match(["a", "b"], 10, BaselineSettings(pairing="exhaustive"))) == 20 * 19 // 2
+
+
+def test_intrinsics_stay_fixed_in_both_methods() -> None:
+    incremental = sfm._incremental_options(BaselineSettings())
+    overall = sfm._global_options(BaselineSettings(num_threads=1))
+    adjustment = overall.mapper.bundle_adjustment
+    assert not (incremental.ba_refine_focal_length or incremental.ba_refine_extra_params)
+    assert not incremental.mapper.abs_pose_refine_focal_length
+    assert not (adjustment.refine_focal_length or adjustment.refine_extra_params)
+    assert not (incremental.ba_refine_principal_point or adjustment.refine_principal_point)
+    assert adjustment.ceres.solver_options.num_threads == 1
+
+
+def test_poses_are_turned_into_camera_to_world_and_missing_ones_are_nan() -> None:
+    wTc = np.eye(4)
+    wTc[:3, :3] = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+    wTc[:3, 3] = [1.0, 2.0, 3.0]
+    cTw = SimpleNamespace(matrix=lambda: np.linalg.inv(wTc)[:3])
+    images = {
+        1: SimpleNamespace(name="b/000002.png", has_pose=True, cam_from_world=lambda: cTw),
+        2: SimpleNamespace(name="a/000000.png", has_pose=False),
+    }
+    trajectories = sfm.read_trajectories(SimpleNamespace(images=images), ["a", "b"], 3)
+    assert np.isnan(trajectories["a"]).all() and np.isnan(trajectories["b"][:2]).all()
+    np.testing.assert_allclose(trajectories["b"][2], wTc, atol=1e-12)
+    assert trajectories["b"].shape == (3, 4, 4)
+
+
+def test_largest_model_wins_and_none_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    small, large = (SimpleNamespace(num_reg_images=lambda n=n: n) for n in (4, 9))
+    found = {0: small, 1: large}
+    monkeypatch.setattr("pycolmap.global_mapping", lambda *_, **__: found)
+    out = tmp_path
+    assert sfm.reconstruct("glomap", out, out / "db", out / "sparse", BaselineSettings()) is large
+    found.clear()
+    with pytest.raises(BaselineError, match="glomap found no model"):
+        sfm.reconstruct("glomap", out, out / "db", out / "sparse", BaselineSettings())
