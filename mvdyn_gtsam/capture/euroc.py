@@ -133,9 +133,9 @@ def _shared_stamps(folder: Path, tables: Mapping[str, Mapping[int, Path]], trunc
         missing = every - set(table)
         if missing and not truncate:
             raise CaptureError(
-                f"{folder}: camera {name} is short: it has no image at {len(missing)} of {len(every)} instants, "
-                f"first at {min(missing)} ns; supply them, or accept the {len(shared)} shared ones with --truncate "
-                "(truncate=True)"
+                f"{folder}: camera {name} is short: it has no image at {len(missing)} of {len(every)} "
+                f"instants, first at {min(missing)} ns; supply them, or accept the {len(shared)} shared ones "
+                "with --truncate (truncate=True)"
             )
     if len(shared) < 2:
         raise CaptureError(

@@ -60,7 +60,8 @@ def capture_from_cameras(
 
     Cameras are named after their files (``cam0.mp4``: cam0; ``left/*.png``: left), or cam0, cam1, ... where
     those would clash or be no file names. ``fps`` comes from the videos unless given; images need it.
-    ``distortion`` (OpenCV order) and ``time_offsets`` (s) are per camera. Raises CaptureError as ``load_capture`` does.
+    ``distortion`` (OpenCV order) and ``time_offsets`` (s) are per camera.
+    Raises CaptureError as ``load_capture`` does.
     """
     if not videos:
         raise CaptureError("no cameras given; name at least one video or image pattern with --camera")

@@ -113,7 +113,7 @@ def _focal_of(scene_folder: Path) -> float:
         if found:
             return float(found[1])
     raise CaptureError(
-        f"{scene_folder}: no folder above has a name like f24_aperture5 to tell the focal length; give focal_mm"
+        f"{scene_folder}: no folder above tells the focal length by a name like f24_aperture5; give focal_mm"
     )
 
 

@@ -155,8 +155,11 @@ class VideoStream(MediaStream):
         """Frame ``time``. Raises CaptureError where the file vanished or can no longer be decoded."""
         _checked_index(time, self._count, self.label)
         if self._owner != os.getpid():
-            # A forked process shares the file position of its parent: it needs a decoder of its own.
+            # A forked process shares its parent's file position and lacks the decoder's threads: it needs
+            # a decoder of its own, and closing the inherited one would wait for those threads for ever.
+            inherited = self._video
             self._reset()
+            self._inherited = inherited
         frame = self._cache.get(time)
         if frame is None:
             frame = self._cache.put(time, self._decode(time))
@@ -176,6 +179,7 @@ class VideoStream(MediaStream):
         self._owner = os.getpid()
         self._cache = _FrameCache(4)
         self._video: Any = None
+        self._inherited: Any = None
         self._position = -1  # the frame grabbed last
         self._stamps: list[float] = []  # time stamp of every frame grabbed on the way forward, ms
 
