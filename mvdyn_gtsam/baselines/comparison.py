@@ -19,7 +19,7 @@ import numpy as np
 from rich.table import Table
 
 from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
-from mvdyn_gtsam.baselines.runner import read_result, run_worker
+from mvdyn_gtsam.baselines.runner import log_path, read_result, run_worker
 from mvdyn_gtsam.baselines.settings import METHODS, BaselineSettings, Method
 from mvdyn_gtsam.errors import BaselineError, MvdynError
 from mvdyn_gtsam.evaluation import GroundTruth, Scores, evaluate, load_groundtruth
@@ -176,7 +176,7 @@ def _run_ours(
     capture: Path, folder: Path, stage: str, arguments: Sequence[str], timeout_s: float | None
 ) -> ProcessUsage:
     command = our_command(capture, folder, stage, arguments)
-    return run_measured(command, folder.with_name(f"{folder.name}.log"), timeout_s=timeout_s)
+    return run_measured(command, log_path(folder), timeout_s=timeout_s)
 
 
 def _result(

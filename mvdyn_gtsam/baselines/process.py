@@ -66,7 +66,7 @@ def run_measured(
             process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             _kill(process)
-            problem = f"stopped after {timeout_s:g} s; log in {log}"
+            problem = f"stopped after {timeout_s:g} s"
             return ProcessUsage(-signal.SIGKILL, time.monotonic() - start, None, None, problem)
         except BaseException:
             _kill(process)
@@ -92,5 +92,5 @@ def _problem(code: int, log: Path) -> str:
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
     last = lines[-1][:300] if lines else "it said nothing"
     if code < 0:
-        return f"killed by {signal.Signals(-code).name}: {last} (log: {log})"
-    return f"{last} (exit code {code}, log: {log})"
+        return f"killed by {signal.Signals(-code).name}: {last}"
+    return f"{last} (exit code {code})"

@@ -56,7 +56,7 @@ def run_baseline(
         raise BaselineError(f"method {method!r} is none of {', '.join(METHODS)}")
     usage = run_worker(capture, method, out, settings, database, truncate, timeout_s)
     if usage.problem is not None:
-        raise BaselineError(f"{method}: {usage.problem}")
+        raise BaselineError(f"{method}: {usage.problem}; log: {log_path(out)}")
     return read_result(method, out, usage)
 
 
@@ -79,9 +79,14 @@ def run_worker(
     except OSError as error:
         raise BaselineError(f"{request_path}: cannot be written ({error.strerror})") from error
     command = [sys.executable, "-m", "mvdyn_gtsam.baselines.worker", str(request_path)]
-    usage = run_measured(command, out.with_name(f"{out.name}.log"), timeout_s=timeout_s)
+    usage = run_measured(command, log_path(out), timeout_s=timeout_s)
     request_path.unlink()
     return usage
+
+
+def log_path(out: Path) -> Path:
+    """Where the process that writes the folder ``out`` puts what it says."""
+    return out.with_name(f"{out.name}.log")
 
 
 def read_result(method: Method, out: Path, usage: ProcessUsage) -> BaselineResult:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -11,6 +12,8 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.errors import EvaluationError
 from mvdyn_gtsam.evaluation.groundtruth import GroundTruth
+
+logger = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 
@@ -83,6 +86,8 @@ def associate(reconstruction: PoseSource, groundtruth: GroundTruth) -> dict[str,
             f"{groundtruth.folder}: knows cameras {groundtruth.cameras}, the reconstruction {sorted(known)};"
             " none is in both"
         )
+    for camera in sorted(known - set(groundtruth.cameras)):
+        logger.warning("%s: no true trajectory in %s, left out of the scores", camera, groundtruth.folder)
     matches = {}
     for camera, (true_times, gTc) in groundtruth.trajectories.items():
         finite = np.isfinite(gTc).all(axis=(1, 2))

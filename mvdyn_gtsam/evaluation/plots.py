@@ -10,23 +10,34 @@ from typing import Any
 import numpy as np
 
 from mvdyn_gtsam.errors import EvaluationError
-from mvdyn_gtsam.evaluation.association import CameraMatch, PoseSource, ReconstructionLike, associate
+from mvdyn_gtsam.evaluation.association import CameraMatch, ReconstructionLike, associate
 from mvdyn_gtsam.evaluation.depth import frame_depth_error
 from mvdyn_gtsam.evaluation.groundtruth import GroundTruth
 from mvdyn_gtsam.evaluation.trajectory import TrajectoryErrors, trajectory_errors
 
 
-def save_plots(reconstruction: PoseSource, groundtruth: GroundTruth, folder: Path) -> list[Path]:
-    """Write ``trajectories.png`` (X-Y and X-Z, metres) and ``error.png`` (position error over time).
+def save_plots(reconstruction: ReconstructionLike, groundtruth: GroundTruth, folder: Path) -> list[Path]:
+    """Write ``trajectories.png`` (X-Y and X-Z, metres), ``error.png`` (position error over time) and, of each
+    camera with estimated and true depth, ``depth_<camera>.png`` (error map of their middle frame).
 
     Raises EvaluationError when matplotlib is missing or the folder cannot be written.
     """
     matches = associate(reconstruction, groundtruth)
     errors = trajectory_errors(matches.values())
-    return [
+    paths = [
         _save(_trajectory_figure(matches, errors), folder / "trajectories.png"),
         _save(_error_figure(matches, errors), folder / "error.png"),
     ]
+    for camera, match in matches.items():
+        both = [
+            time
+            for time in groundtruth.depth_frames(camera)
+            if time < match.estimated_frame_count and reconstruction.has_depth(camera, time)
+        ]
+        if both:
+            path = folder / f"depth_{camera}.png"
+            paths.append(save_depth_plot(reconstruction, groundtruth, camera, both[len(both) // 2], path))
+    return paths
 
 
 def save_depth_plot(

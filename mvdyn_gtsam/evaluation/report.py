@@ -38,6 +38,14 @@ def format_table(scores: Scores) -> Table:
     return table
 
 
+def _share(scores: Scores) -> str:
+    """The translation error of the start in terms of the scene's depth, which is how it is judged."""
+    if scores.median_depth_m is None or scores.inter_camera_start_trans_m is None:
+        return ""
+    share = 100 * scores.inter_camera_start_trans_m / scores.median_depth_m
+    return f" (the start's error is {share:.1f} % of it)"
+
+
 def _notes(scores: Scores) -> list[str]:
     notes = ["One Sim(3) over all cameras; RMSE. Abs.Rel and d<1.25 after one scale and offset per frame."]
     if not scores.complete:
@@ -51,7 +59,7 @@ def _notes(scores: Scores) -> list[str]:
             f" {number(scores.inter_camera_rot_deg, 3)} deg;"
             f" at the start {number(scores.inter_camera_start_trans_m)} m,"
             f" {number(scores.inter_camera_start_rot_deg, 3)} deg."
-            f" Median true depth {number(scores.median_depth_m, 2)} m."
+            f" Median true depth {number(scores.median_depth_m, 2)} m{_share(scores)}."
         )
     depth = scores.depth
     if depth is not None and depth.frames_without_estimate:

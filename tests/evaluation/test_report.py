@@ -54,6 +54,7 @@ def test_plots_are_written(case: tuple[FakeReconstruction, Path], tmp_path: Path
     groundtruth = load_groundtruth(folder)
     paths = save_plots(reconstruction, groundtruth, tmp_path / "plots")
     paths.append(save_depth_plot(reconstruction, groundtruth, "cam0", 3, tmp_path / "plots" / "depth.png"))
+    assert [path.name for path in paths] == ["trajectories.png", "error.png", "depth_cam0.png", "depth.png"]
     for path in paths:
         assert path.read_bytes().startswith(b"\x89PNG")
 
