@@ -28,7 +28,7 @@ from mvdyn_gtsam.reconstruction.manifest import (
 
 log = logging.getLogger(__name__)
 
-_OUR_FOLDERS = ("trajectories", "depth", "confidence", "diagnostics")
+_OUR_FOLDERS = ("trajectories", "depth", "confidence", "diagnostics", "exports", "pictures")
 
 
 class ReconstructionWriter:
@@ -70,7 +70,7 @@ class ReconstructionWriter:
             manifest.update(status=Status.RUNNING.value, config=fresh["config"], versions=fresh["versions"])
         else:
             if is_reconstruction(folder):
-                _remove_reconstruction(folder)
+                remove_reconstruction(folder)
             manifest = fresh
         writer = ReconstructionWriter(folder, manifest)
         writer._write_manifest()
@@ -224,7 +224,8 @@ def _refuse_mismatch(folder: Path, manifest: Mapping[str, Any], fresh: Mapping[s
             )
 
 
-def _remove_reconstruction(folder: Path) -> None:
+def remove_reconstruction(folder: Path) -> None:
+    """Remove what a run wrote to ``folder``; other files stay. Raises ResultError when that fails."""
     # The manifest last: were the removal interrupted, the folder is still known as ours.
     try:
         for name in _OUR_FOLDERS:

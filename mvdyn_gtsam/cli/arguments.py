@@ -1,0 +1,87 @@
+"""Arguments that several verbs share, and how they are read."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mvdyn_gtsam.config import Config, load_config
+from mvdyn_gtsam.errors import CaptureError
+
+if TYPE_CHECKING:
+    from mvdyn_gtsam.capture import Capture
+
+
+def add_capture_arguments(parser: argparse.ArgumentParser) -> None:
+    """CAPTURE, or --camera and --intrinsics in its place."""
+    parser.add_argument(
+        "capture",
+        nargs="?",
+        type=Path,
+        metavar="CAPTURE",
+        help="folder with capture.json, or of a known layout (EuRoC, MultiCamVideo, folder per camera)",
+    )
+    group = parser.add_argument_group("cameras in place of CAPTURE (repeat both, in the same order)")
+    group.add_argument(
+        "--camera", action="append", default=[], metavar="VIDEO", help="a video, or a quoted glob of images"
+    )
+    group.add_argument(
+        "--intrinsics",
+        action="append",
+        default=[],
+        metavar="FX,FY,CX,CY",
+        help="its pinhole intrinsics in px, pixel centres at integers",
+    )
+    group.add_argument("--fps", type=float, help="frame rate, where the files do not say it")
+    parser.add_argument(
+        "--truncate", action="store_true", help="accept cameras of different length: cut all to the shortest"
+    )
+
+
+def add_config_arguments(parser: argparse.ArgumentParser) -> None:
+    """--config and --set."""
+    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML or JSON file of settings")
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change one setting, e.g. tracking.window=20; repeatable; `mvdyn config` lists all",
+    )
+
+
+def read_config(arguments: argparse.Namespace) -> Config:
+    """The configuration the arguments ask for. Raises ConfigError."""
+    overrides = list(arguments.overrides)
+    if getattr(arguments, "truncate", False):
+        overrides.append("capture.truncate=true")
+    return load_config(arguments.config, overrides)
+
+
+def read_capture(arguments: argparse.Namespace, config: Config) -> Capture:
+    """The checked capture the arguments name. Raises CaptureError."""
+    from mvdyn_gtsam.capture import capture_from_cameras, open_capture
+
+    truncate = config.capture.truncate
+    if arguments.capture is None and not arguments.camera:
+        raise CaptureError("no input: give a CAPTURE folder, or --camera with --intrinsics for each video")
+    if arguments.capture is not None:
+        if arguments.camera or arguments.intrinsics:
+            raise CaptureError(f"{arguments.capture}: give either a CAPTURE folder or --camera, not both")
+        return open_capture(arguments.capture, truncate=truncate, fps=arguments.fps)
+    intrinsics = [parse_intrinsics(text) for text in arguments.intrinsics]
+    return capture_from_cameras(arguments.camera, intrinsics, fps=arguments.fps, truncate=truncate)
+
+
+def parse_intrinsics(text: str) -> tuple[float, ...]:
+    """``"fx,fy,cx,cy"`` as four finite numbers. Raises CaptureError."""
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 4 or not all(math.isfinite(value) for value in values):
+        raise CaptureError(f"--intrinsics {text}: write four numbers, fx,fy,cx,cy in px")
+    return values

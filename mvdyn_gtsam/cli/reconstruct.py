@@ -1,0 +1,136 @@
+"""``mvdyn reconstruct``."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from mvdyn_gtsam.cli.arguments import add_capture_arguments, add_config_arguments, read_capture, read_config
+from mvdyn_gtsam.cli.progress import ConsoleProgress
+from mvdyn_gtsam.errors import ConfigError, ResultError
+
+if TYPE_CHECKING:
+    from mvdyn_gtsam.capture import Capture
+    from mvdyn_gtsam.config import Config
+    from mvdyn_gtsam.reconstruction import Reconstruction
+
+SUMMARY = "recover every camera's pose and depth for every frame"
+DESCRIPTION = """\
+Recover the pose of every camera and a dense depth map for every frame, in one world frame.
+OUT gets manifest.json, trajectories/<camera>.txt (TUM, camera-to-world), depth/ and confidence/.
+Ctrl-C at any time: what is in OUT can be read, and --resume continues."""
+EPILOG = """\
+examples:
+  mvdyn reconstruct clip --out result
+  mvdyn reconstruct --camera a.mp4 --intrinsics 800,800,639.5,359.5 \\
+                    --camera b.mp4 --intrinsics 810,810,639.5,359.5 --out result
+  mvdyn reconstruct clip --out result --set tracking.window=20"""
+
+STAGES = ("tracking", "refinement")
+BUILT_STAGES = ("tracking",)
+BYTES_PER_PIXEL = 1.0
+"""Depth and confidence on disk, measured 0.9 on noisy depth."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the verb."""
+    add_capture_arguments(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder of the result")
+    parser.add_argument(
+        "--stage", choices=STAGES, default=BUILT_STAGES[-1], help="last stage to run (default: %(default)s)"
+    )
+    add_config_arguments(parser)
+    again = parser.add_mutually_exclusive_group()
+    again.add_argument("--resume", action="store_true", help="continue the run that OUT holds")
+    again.add_argument(
+        "--overwrite", action="store_true", help="remove the reconstruction that OUT holds first"
+    )
+
+
+def run(arguments: argparse.Namespace, messages: Console) -> int:
+    """Run the verb."""
+    if arguments.stage not in BUILT_STAGES:
+        raise ConfigError(f"--stage {arguments.stage} is not available in this version; use --stage tracking")
+    from mvdyn_gtsam.reconstruction import refuse_unusable
+
+    config = read_config(arguments)
+    refuse_unusable(arguments.out, resume=arguments.resume, overwrite=arguments.overwrite)
+    capture = read_capture(arguments, config)
+    started = time.monotonic()
+    result = reconstruct_with_progress(
+        capture,
+        arguments.out,
+        config,
+        stage=arguments.stage,
+        resume=arguments.resume,
+        overwrite=arguments.overwrite,
+        messages=messages,
+    )
+    for line in summary(result, time.monotonic() - started):
+        Console(soft_wrap=True, highlight=False, markup=False).print(line)
+    return 0
+
+
+def reconstruct_with_progress(
+    capture: Capture,
+    out: Path,
+    config: Config,
+    *,
+    stage: str,
+    resume: bool,
+    overwrite: bool,
+    messages: Console,
+) -> Reconstruction:
+    """Say what will be done, do it, show how far it is."""
+    for line in announcement(capture, out):
+        messages.print(line)
+    from mvdyn_gtsam.pipeline import reconstruct
+    from mvdyn_gtsam.reconstruction import is_reconstruction, remove_reconstruction
+
+    if overwrite and is_reconstruction(out):
+        remove_reconstruction(out)
+    with ConsoleProgress(messages) as progress:
+        return reconstruct(capture, out, config, stage=stage, resume=resume, progress=progress)
+
+
+def announcement(capture: Capture, out: Path) -> list[str]:
+    """What is about to be reconstructed and how much disk it takes."""
+    sizes = sorted({f"{camera.width}x{camera.height}" for camera in capture.cameras})
+    pixels = sum(camera.width * camera.height for camera in capture.cameras) * capture.frame_count
+    needed = pixels * BYTES_PER_PIXEL
+    lines = [
+        f"{capture.name}: {len(capture.cameras)} cameras x {capture.frame_count} frames, {', '.join(sizes)},"
+        f" {capture.fps:g} fps; the result takes about {needed / 1e6:.0f} MB in {out}"
+    ]
+    if len(capture.cameras) == 1:
+        lines.append("one camera only: its depth rests on its own motion, and what moves is not seen twice")
+    parent = next((folder for folder in (out, *out.absolute().parents) if folder.exists()), Path("/"))
+    free = shutil.disk_usage(parent).free
+    if free < needed:
+        raise ResultError(
+            f"{out}: the result takes about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left;"
+            " free space or choose another --out"
+        )
+    return lines
+
+
+def summary(result: Reconstruction, seconds: float) -> list[str]:
+    """What came out, in lines for people."""
+    import numpy as np
+
+    posed = sum(
+        int(np.isfinite(result.trajectory(name)[1]).all(axis=(1, 2)).sum()) for name in result.cameras
+    )
+    total = result.frame_count * len(result.cameras)
+    lines = [f"{posed} of {total} frames have a pose; {seconds:.0f} s; result in {result.folder}"]
+    if len(result.groups) > 1:
+        groups = "; ".join(", ".join(group) for group in result.groups)
+        lines.append(f"no view connects these groups of cameras, each has a world frame of its own: {groups}")
+    lines += [str(note) for note in result.manifest.get("notes", [])]
+    lines.append(f"next: mvdyn export {result.folder} --format nerfstudio|colmap|ply|tum")
+    return lines
