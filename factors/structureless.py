@@ -18,7 +18,7 @@ gradient of the re-weighted system; Levenberg-Marquardt therefore accepts or rej
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import gtsam
@@ -26,9 +26,19 @@ import numpy as np
 import numpy.typing as npt
 
 from factors.compression import compress_gram, rotate_residual_to_last
-from factors.flow_terms import FlowTerms, edge_rays, flow_terms, read_only_copy, weighted_rows
+from factors.flow_terms import FlowTerms, edge_rays, flow_terms, weighted_rows
+from factors.measurement import StructurelessMeasurement
 from factors.projection import adjoint, relative_poses
-from factors.robust import Loss, LossName, make_loss
+
+__all__ = [
+    "EdgeResiduals",
+    "StructurelessMeasurement",
+    "edge_residuals",
+    "evaluate",
+    "linearize",
+    "solve_log_depths",
+    "structureless_flow_factor",
+]
 
 Array = npt.NDArray[np.float64]
 
@@ -37,83 +47,6 @@ LOG_DEPTH_RANGE = 4.0
 free."""
 MAXIMUM_STEP = 0.7
 """Longest single log-depth step (a factor of 2)."""
-
-
-@dataclass(frozen=True, eq=False)
-class StructurelessMeasurement:
-    """Dense flow of the N grid points of keyframe i to E frames; arrays are copied and made read-only.
-
-    Raises ValueError when shapes disagree, a depth start is not finite or a weight is negative. NaN targets
-    or weights count as no measurement, a NaN prior log depth or an infinite sigma as no prior.
-    """
-
-    rays: Array
-    """``(N, 3)`` with z = 1, in frame i."""
-    initial_log_depth: Array
-    """``(N,)`` where the solution for the log depths starts."""
-    prior_log_depth: Array
-    """``(N,)`` mean of the prior before the scale: log D_i."""
-    prior_sigma: Array
-    """``(N,)`` standard deviation of the prior, in log depth."""
-    intrinsics_j: Array
-    """``(E, 4)`` fx fy cx cy, px."""
-    target: Array
-    """``(E, N, 2)`` where the flow leads, px in frame j."""
-    weight: Array
-    """``(E, N)`` in [0, 1]; 0 is no measurement."""
-    robust_px: float = 1.0
-    """Scale of the robust loss, px."""
-    noise_px: float = 1.0
-    """Standard deviation of a flow component of weight one, px."""
-    loss: LossName = "cauchy"
-    steps: int = 4
-    """Gauss-Newton steps for the log depths per evaluation."""
-    kernel: Loss = field(init=False, repr=False)
-    """The robust loss itself."""
-    planar_rays: Array = field(init=False, repr=False)
-    """``(3, N)``"""
-    planar_target: Array = field(init=False, repr=False)
-    """``(2, E, N)``; zero where there is no measurement."""
-    information: Array = field(init=False, repr=False)
-    """``(E, N)`` weight over squared noise."""
-    prior_information: Array = field(init=False, repr=False)
-    """``(N,)``, 1 / sigma^2."""
-
-    def __post_init__(self) -> None:
-        _check_shapes(self)
-        if not self.noise_px > 0.0:
-            raise ValueError(f"noise_px must be positive, got {self.noise_px}")
-        target = np.asarray(self.target, dtype=np.float64)
-        weight = np.asarray(self.weight, dtype=np.float64)
-        measured = np.isfinite(target).all(axis=2) & np.isfinite(weight)
-        weight = np.where(measured, weight, 0.0)
-        planar_target = np.where(measured, np.moveaxis(target, 2, 0), 0.0)
-        prior = np.asarray(self.prior_log_depth, dtype=np.float64)
-        sigma = np.asarray(self.prior_sigma, dtype=np.float64)
-        if (weight < 0.0).any():
-            raise ValueError("weights must not be negative")
-        if not np.isfinite(self.initial_log_depth).all():
-            raise ValueError("every initial log depth must be finite")
-        if not (sigma > 0.0).all():
-            raise ValueError("every prior sigma must be positive (use inf for no prior)")
-        has_prior = np.isfinite(prior)
-        arrays = {
-            "planar_rays": np.asarray(self.rays, dtype=np.float64).T,
-            "initial_log_depth": self.initial_log_depth,
-            "prior_log_depth": np.where(has_prior, prior, 0.0),
-            "prior_sigma": sigma,
-            "prior_information": np.where(has_prior, sigma**-2.0, 0.0),
-            "intrinsics_j": self.intrinsics_j,
-            "planar_target": planar_target,
-            "weight": weight,
-            "information": weight / self.noise_px**2,
-        }
-        for name, array in arrays.items():
-            object.__setattr__(self, name, read_only_copy(array))
-        object.__setattr__(self, "rays", self.planar_rays.T)
-        # a view: the planar copy is the only one kept
-        object.__setattr__(self, "target", np.moveaxis(self.planar_target, 0, 2))
-        object.__setattr__(self, "kernel", make_loss(self.loss, self.robust_px))
 
 
 @dataclass(frozen=True)
@@ -371,8 +304,7 @@ def _reduced_gram(measurement: StructurelessMeasurement, solution: _Solution) ->
         coupling += rows[:6, 1]
     np.multiply(-measurement.prior_information, inverse_root, out=columns[twists])
     np.multiply(solution.gradient, inverse_root, out=columns[twists + 1])
-    gram = columns @ columns.T
-    np.negative(gram, out=gram)
+    gram = -_outer_sum(columns)
     for edge in range(edges):
         span = slice(6 * edge, 6 * edge + 6)
         gram[span, span] += blocks[edge, :6, :6]
@@ -387,23 +319,22 @@ def _reduced_gram(measurement: StructurelessMeasurement, solution: _Solution) ->
     return gram
 
 
+def _outer_sum(columns: Array) -> Array:
+    """``columns @ columns.T`` in pieces too small for the BLAS to hand to threads.
+
+    Threads gain nothing at this size and, on a busy machine, waiting for them took ten times the product
+    itself.
+    """
+    rows, points = columns.shape
+    if rows < 64:
+        return columns @ columns.T
+    total = np.zeros((rows, rows))
+    length = max(1, 2**18 // rows**2)
+    for start in range(0, points, length):
+        piece = columns[:, start : start + length]
+        total += piece @ piece.T
+    return total
+
+
 def _inverse_root(hessian: Array, free: npt.NDArray[np.bool_]) -> Array:
     return np.sqrt(np.divide(1.0, hessian, out=np.zeros_like(hessian), where=free & (hessian > 1e-12)))
-
-
-def _check_shapes(measurement: StructurelessMeasurement) -> None:
-    points = len(measurement.rays)
-    edges = len(measurement.weight)
-    expected = {
-        "rays": (points, 3),
-        "initial_log_depth": (points,),
-        "prior_log_depth": (points,),
-        "prior_sigma": (points,),
-        "intrinsics_j": (edges, 4),
-        "target": (edges, points, 2),
-        "weight": (edges, points),
-    }
-    for name, shape in expected.items():
-        actual = np.shape(getattr(measurement, name))
-        if actual != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {actual}")
