@@ -18,8 +18,9 @@ Array = npt.NDArray[np.float64]
 class StructurelessMeasurement:
     """Dense flow of the N grid points of keyframe i to E frames; arrays are copied and made read-only.
 
-    Raises ValueError when shapes disagree, a depth start is not finite or a weight is negative. NaN targets
-    or weights count as no measurement, a NaN prior log depth or an infinite sigma as no prior.
+    Raises ValueError when shapes disagree, a ray, depth start or intrinsic is not finite or a weight is
+    negative. NaN targets or weights count as no measurement, a NaN prior log depth or an infinite sigma as no
+    prior.
     """
 
     rays: Array
@@ -67,8 +68,9 @@ class StructurelessMeasurement:
         sigma = np.asarray(self.prior_sigma, dtype=np.float64)
         if (weight < 0.0).any():
             raise ValueError("weights must not be negative")
-        if not np.isfinite(self.initial_log_depth).all():
-            raise ValueError("every initial log depth must be finite")
+        for name in ("rays", "initial_log_depth", "intrinsics_j"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name} must be finite")
         if not (sigma > 0.0).all():
             raise ValueError("every prior sigma must be positive (use inf for no prior)")
         has_prior = np.isfinite(prior)

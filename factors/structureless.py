@@ -12,8 +12,9 @@ eliminating them: one scalar Schur complement per point, cf. "smart factors" (Ca
 the point elimination of bundle adjustment (Triggs et al., 2000).
 
 The factor returns the system in square-root form of 6 E + 2 rows. Its error vector is ``[0, ..., 0, sqrt(2
-cost)]`` with and without Jacobians, so ``error()`` is exactly the robust cost, and ``J^T e`` is exactly the
-gradient of the re-weighted system; Levenberg-Marquardt therefore accepts or rejects by the true robust cost.
+cost)]`` with and without Jacobians, so ``error()`` is exactly the robust cost, and ``J^T e`` is the
+gradient of the re-weighted system with the log depths eliminated, which is the gradient of the robust cost
+once the log depths have converged. Levenberg-Marquardt therefore accepts or rejects by the true robust cost.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import gtsam
@@ -85,15 +86,7 @@ def test_solved_depths_are_a_minimum_with_the_stated_information() -> None:
     log_depth, information = solve_log_depths(measurement, wTi, wTj, 0.0)
     cost = evaluate(measurement, wTi, wTj, 0.0)[0]
     for offset in (-1e-3, 1e-3):
-        moved = StructurelessMeasurement(
-            **{name: getattr(measurement, name) for name in ("rays", "prior_log_depth", "prior_sigma")},
-            intrinsics_j=measurement.intrinsics_j,
-            initial_log_depth=log_depth + offset,
-            target=measurement.target,
-            weight=measurement.weight,
-            loss="none",
-            steps=0,
-        )
+        moved = replace(measurement, initial_log_depth=log_depth + offset, steps=0)
         # the rise of the cost is half the information times the square of the step, residual curvature aside
         rise = evaluate(moved, wTi, wTj, 0.0)[0] - cost
         np.testing.assert_allclose(rise, 0.5 * information.sum() * offset**2, rtol=0.05)
@@ -130,6 +123,24 @@ def test_gradient_is_that_of_the_robust_cost(loss: LossName, seed: int) -> None:
     gradient = rows[:, :-1].T @ rows[:, -1]
     expected = numerical_jacobian(cost, 25)[0]
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+
+
+def test_many_edges_have_the_gradient_too() -> None:
+    """Above ten edges the Gram matrix is summed in pieces."""
+    rng = np.random.default_rng(23)
+    scene = make_scene(rng, 90, 12)
+    measurement = _noisy(scene, rng, loss="none", steps=20)
+    poses = perturbed(rng, scene.poses, 0.005)
+    direction = rng.normal(size=6 * 13 + 1)
+
+    def cost(length: Array) -> Array:
+        delta = length[0] * direction
+        moved = matrices([pose.retract(delta[6 * k : 6 * k + 6]) for k, pose in enumerate(poses)])
+        return np.array(evaluate(measurement, moved[0], moved[1:], delta[-1])[0])
+
+    rows = linearize(measurement, poses[0].matrix(), matrices(poses[1:]), 0.0)
+    gradient = rows[:, :-1].T @ rows[:, -1]
+    np.testing.assert_allclose(gradient @ direction, numerical_jacobian(cost, 1, step=1e-6)[0, 0], rtol=1e-5)
 
 
 def _flow_error(
@@ -483,10 +494,12 @@ def test_later_changes_to_the_arrays_do_not_reach_the_factor() -> None:
     [
         ({"weight": np.ones((2, 9))}, r"weight must have shape \(2, 10\)"),
         ({"weight": -np.ones((2, 10))}, "negative"),
-        ({"initial_log_depth": np.full(10, np.nan)}, "initial log depth must be finite"),
+        ({"initial_log_depth": np.full(10, np.nan)}, "initial_log_depth must be finite"),
         ({"prior_sigma": np.zeros(10)}, "sigma must be positive"),
         ({"noise_px": 0.0}, "noise_px"),
         ({"intrinsics_j": np.ones((1, 4))}, "intrinsics_j must have shape"),
+        ({"intrinsics_j": np.full((2, 4), np.nan)}, "intrinsics_j must be finite"),
+        ({"rays": np.full((10, 3), np.inf)}, "rays must be finite"),
     ],
 )
 def test_bad_measurements_are_refused(change: dict[str, object], message: str) -> None:
