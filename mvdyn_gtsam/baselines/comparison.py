@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich import box
 from rich.table import Table
 
 from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
@@ -82,9 +83,12 @@ class Comparison:
 
     def to_table(self) -> Table:
         """The same for the terminal."""
-        table = Table(title=self.capture)
+        # Must fit 80 columns: headings break before their unit, figures never break.
+        table = Table(title=self.capture, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
         for name in _COLUMNS:
-            table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
+            table.add_column(
+                "\n".join(name.rsplit(" ", 1)), justify="left" if name == "method" else "right", no_wrap=True
+            )
         for result in self.results:
             table.add_row(*_cells(result))
         table.caption = "\n".join(self._notes()) or None
@@ -105,8 +109,8 @@ _COLUMNS = (
     "ATE m",
     "RTE m",
     "RRE deg",
-    "between m",
-    "between deg",
+    "inter-camera m",
+    "inter-camera deg",
     "s",
     "peak MB",
 )
