@@ -52,7 +52,7 @@ def write_images(
     return paths
 
 
-def camera_entry(name: str, source: str, **changes: Any) -> dict[str, Any]:
+def camera_entry(name: str, source: str, /, **changes: Any) -> dict[str, Any]:
     """One camera of ``capture.json``, for media of the default size."""
     entry = {"name": name, "source": source, "width": WIDTH, "height": HEIGHT}
     entry |= {"fx": 60.0, "fy": 60.0, "cx": (WIDTH - 1) / 2, "cy": (HEIGHT - 1) / 2}
