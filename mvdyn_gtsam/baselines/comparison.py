@@ -86,9 +86,8 @@ class Comparison:
         # Must fit 80 columns: headings break before their unit, figures never break.
         table = Table(title=self.capture, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
         for name in _COLUMNS:
-            table.add_column(
-                "\n".join(name.rsplit(" ", 1)), justify="left" if name == "method" else "right", no_wrap=True
-            )
+            heading = "\n".join(name.replace("inter-", "inter- ").split())
+            table.add_column(heading, justify="left" if name == "method" else "right", no_wrap=True)
         for result in self.results:
             table.add_row(*_cells(result))
         table.caption = "\n".join(self._notes()) or None

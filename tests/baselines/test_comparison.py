@@ -145,3 +145,16 @@ def test_our_command_is_the_one_a_user_would_give() -> None:
         *("-m", "mvdyn_gtsam.cli.main", "reconstruct", "capture", "--out", "out"),
         *("--stage", "tracking", "--overwrite", "--set", "a=1"),
     ]
+
+
+def test_a_camera_without_any_pose_is_incomplete_and_not_an_error(
+    truth: dict[str, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ours(capture: Path, folder: Path, *_: object) -> ProcessUsage:
+        write_result(folder, {"cam0": truth["cam0"], "cam1": np.full_like(truth["cam1"], np.nan)})
+        return usage()
+
+    monkeypatch.setattr(comparison_module, "_run_ours", ours)
+    groundtruth = tmp_path / "capture" / "groundtruth"
+    (result,) = compare(tmp_path / "capture", groundtruth, ["ours"], tmp_path / "out").results
+    assert result.problem is None and result.registered == 0.5

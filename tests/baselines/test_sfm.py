@@ -1,15 +1,19 @@
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from mvdyn_gtsam.baselines import sfm
 from mvdyn_gtsam.baselines.settings import BaselineSettings
-from mvdyn_gtsam.errors import BaselineError
+from mvdyn_gtsam.capture import load_capture
+from mvdyn_gtsam.errors import BaselineError, CaptureError
+from tests.baselines.scenes import CX, CY, FOCAL, HEIGHT, WIDTH, write_capture
 
 
 def test_pairs_are_those_of_the_paper() -> None:
@@ -80,3 +84,54 @@ def test_largest_model_wins_and_none_is_an_error(monkeypatch: pytest.MonkeyPatch
     found.clear()
     with pytest.raises(BaselineError, match="glomap found no model"):
         sfm.reconstruct("glomap", out, out / "db", out / "sparse", BaselineSettings())
+
+
+def test_no_features_where_something_moves(tmp_path: Path) -> None:
+    capture_folder, moving, images = tmp_path / "capture", tmp_path / "moving", tmp_path / "images"
+    write_capture(capture_folder, frames=1, cameras=1)
+    capture = load_capture(capture_folder)
+    mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    mask[:, : WIDTH // 2] = 255
+    (moving / "cam0").mkdir(parents=True)
+    assert cv2.imwrite(str(moving / "cam0" / "000000.png"), mask)
+    sfm.write_frames(capture, images)
+    sfm.write_masks(capture, moving, tmp_path / "masks")
+    settings = BaselineSettings(num_threads=1)
+    for name, masks in (("plain", None), ("masked", tmp_path / "masks")):
+        sfm.extract_features(capture.cameras, 1, images, tmp_path / f"{name}.db", settings, masks)
+    plain, masked = (_keypoints(tmp_path / f"{name}.db") for name in ("plain", "masked"))
+    assert (plain[:, 0] < WIDTH // 2 - 1).sum() > 20
+    assert len(masked) > 20 and (masked[:, 0] >= WIDTH // 2 - 1).all()
+
+
+def test_a_missing_or_wrongly_sized_mask_is_named(tmp_path: Path) -> None:
+    write_capture(tmp_path / "capture", frames=1, cameras=1)
+    capture = load_capture(tmp_path / "capture")
+    with pytest.raises(CaptureError, match="000000.png: no readable motion mask"):
+        sfm.write_masks(capture, tmp_path / "moving", tmp_path / "masks")
+    (tmp_path / "moving" / "cam0").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "moving" / "cam0" / "000000.png"), np.zeros((4, 4), dtype=np.uint8))
+    with pytest.raises(CaptureError, match="000000.png: mask is"):
+        sfm.write_masks(capture, tmp_path / "moving", tmp_path / "masks")
+
+
+def test_the_database_holds_one_pinhole_camera_per_device_at_colmaps_pixel_centres(tmp_path: Path) -> None:
+    write_capture(tmp_path / "capture", frames=2)
+    capture = load_capture(tmp_path / "capture")
+    sfm.write_frames(capture, tmp_path / "images")
+    database = tmp_path / "a.db"
+    sfm.extract_features(capture.cameras, 2, tmp_path / "images", database, BaselineSettings(num_threads=1))
+    with sqlite3.connect(database) as connection:
+        cameras = connection.execute("SELECT params, prior_focal_length FROM cameras").fetchall()
+        images = connection.execute("SELECT name FROM images").fetchall()
+    assert sorted(name for (name,) in images) == [f"cam{k}/{t:06d}.png" for k in (0, 1) for t in (0, 1)]
+    assert len(cameras) == 2
+    for params, prior in cameras:
+        np.testing.assert_allclose(np.frombuffer(params), [FOCAL, FOCAL, CX + 0.5, CY + 0.5])
+        assert prior == 1
+
+
+def _keypoints(database: Path) -> np.ndarray:
+    with sqlite3.connect(database) as connection:
+        rows, columns, data = connection.execute("SELECT rows, cols, data FROM keypoints").fetchone()
+    return np.frombuffer(data, dtype=np.float32).reshape(rows, columns)
