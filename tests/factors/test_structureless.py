@@ -435,15 +435,24 @@ def test_points_behind_a_camera_cost_and_do_not_pull() -> None:
     assert np.isinf(residuals.norms_px[0]).all()
 
 
-def test_depths_that_want_to_leave_are_held_at_the_limit() -> None:
-    scene = make_scene(np.random.default_rng(44), 30, 2)
+def test_depths_that_want_to_leave_are_held_at_the_limit_and_count_as_known() -> None:
+    rng = np.random.default_rng(44)
+    scene = make_scene(rng, 30, 2)
     start = scene.log_depth.copy()
-    start[0] -= LOG_DEPTH_RANGE + 0.5
-    wide = measure(scene, initial_log_depth=start, prior_sigma=np.full(30, 0.01), steps=CONVERGED)
-    wTi, wTj = scene.wTi.matrix(), matrices(scene.wTj)
-    log_depth, _ = solve_log_depths(wide, wTi, wTj, 0.0)
-    np.testing.assert_allclose(log_depth[0], start[0] + LOG_DEPTH_RANGE)
-    assert np.isfinite(linearize(wide, wTi, wTj, 0.0)).all()
+    start[:10] += LOG_DEPTH_RANGE + 0.5
+    sigma = np.where(np.arange(30) < 10, 0.01, 0.3)
+    wide = measure(scene, initial_log_depth=start, prior_sigma=sigma, loss="none", steps=30)
+    wTj = matrices(scene.wTj)
+    log_depth, _ = solve_log_depths(wide, scene.wTi.matrix(), wTj, 0.0)
+    np.testing.assert_allclose(log_depth[:10], start[:10] - LOG_DEPTH_RANGE)
+
+    def cost(delta: Array) -> Array:
+        return np.array(evaluate(wide, scene.wTi.retract(delta[:6]).matrix(), wTj, delta[6])[0])
+
+    rows = linearize(wide, scene.wTi.matrix(), wTj, 0.0)
+    gradient = (rows[:, :-1].T @ rows[:, -1])[[0, 1, 2, 3, 4, 5, -1]]
+    expected = numerical_jacobian(cost, 7)[0]
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 
 
 def test_edge_residuals_tell_the_bad_edge() -> None:
