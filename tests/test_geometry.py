@@ -50,7 +50,7 @@ def intrinsics(draw: Any) -> Array:
     return np.array([[fx, 0, draw(st.floats(0, 640))], [0, fy, draw(st.floats(0, 480))], [0, 0, 1]])
 
 
-def _close(actual: Array, expected: Array, atol: float = 1e-9) -> None:
+def _close(actual: npt.ArrayLike, expected: npt.ArrayLike, atol: float = 1e-9) -> None:
     np.testing.assert_allclose(actual, expected, atol=atol)
 
 
@@ -93,7 +93,7 @@ def test_rotation_angle_is_the_angle_turned(axis: Array, angle: float) -> None:
     if np.linalg.norm(axis) < 1e-3:
         axis = np.array([0.0, 0.0, 1.0])
     rotvec = np.radians(angle) * axis / np.linalg.norm(axis)
-    _close(rotation_angle_deg(Rotation.from_rotvec(rotvec).as_matrix()), np.array(angle), 1e-5)
+    _close(rotation_angle_deg(Rotation.from_rotvec(rotvec).as_matrix()), angle, 1e-5)
 
 
 @given(aTb=poses(), aTc=poses(), fraction=fractions)
@@ -161,7 +161,7 @@ def test_similarity_moves_poses_with_their_points(aSb: Similarity, bTc: Array, c
     moved = aSb.transform_points(transform_points(bTc, c_points))
     _close(transform_points(invert_pose(aTc), moved), aSb.scale * c_points, 1e-6)
     _close(aTc[:3, :3] @ aTc[:3, :3].T, np.eye(3))
-    _close(np.array(np.linalg.det(aTc[:3, :3])), np.array(1.0))
+    _close(np.linalg.det(aTc[:3, :3]), 1.0)
 
 
 @given(aSb=similarities(), bTc=poses(), bTd=poses())

@@ -70,6 +70,7 @@ def assemble_capture(
     for source in sources:
         _check_camera(source.camera)
         _check_size(source)
+    _check_labels(sources)
     check_rate(fps, name)
     _check_rates(fps, sources)
     _check_lengths(sources, truncate, num_frames)
@@ -109,6 +110,17 @@ def _check_names(capture: str, names: Sequence[str]) -> None:
         if name.lower() in seen:
             raise CaptureError(f"{capture}: two cameras are named {name!r}; give each camera its own name")
         seen.add(name.lower())
+
+
+def _check_labels(sources: Sequence[Source]) -> None:
+    users: dict[str, str] = {}
+    for source in sources:
+        label, name = source.media.label, source.camera.name
+        if label in users:
+            logger.warning(
+                "%s: cameras %s and %s read the same frames; is this meant?", label, users[label], name
+            )
+        users[label] = name
 
 
 def _check_camera(camera: Camera) -> None:

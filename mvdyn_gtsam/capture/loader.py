@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import logging
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -170,7 +170,7 @@ def _number(content: Mapping[str, Any], key: str, where: str) -> float:
 
 
 def _as_number(value: object, key: str, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         raise CaptureError(f'{where}: "{key}" must be a finite number, not {json.dumps(value)}')
     return float(value)
 

@@ -119,6 +119,8 @@ class VideoStream(MediaStream):
     fewer frames than its container promises.
     """
 
+    _inherited: Any
+
     def __init__(self, path: Path, accept_truncated: bool = False) -> None:
         self.path = path
         self.label = str(path)
@@ -179,7 +181,7 @@ class VideoStream(MediaStream):
         self._owner = os.getpid()
         self._cache = _FrameCache(4)
         self._video: Any = None
-        self._inherited: Any = None
+        self._inherited = None
         self._position = -1  # the frame grabbed last
         self._stamps: list[float] = []  # time stamp of every frame grabbed on the way forward, ms
 
