@@ -50,7 +50,7 @@ def intrinsics(draw: Any) -> Array:
     return np.array([[fx, 0, draw(st.floats(0, 640))], [0, fy, draw(st.floats(0, 480))], [0, 0, 1]])
 
 
-def _close(actual: npt.ArrayLike, expected: npt.ArrayLike, atol: float = 1e-9) -> None:
+def _close(actual: Any, expected: Any, atol: float = 1e-9) -> None:
     np.testing.assert_allclose(actual, expected, atol=atol)
 
 
