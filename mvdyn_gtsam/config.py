@@ -52,7 +52,24 @@ class GraphConfig:
     temporal_offsets: tuple[int, ...] = (1, 2, 4, 8)
     """Frame distances of temporal edges, both directions. Source: measured, DIS flow at 512x384."""
     max_active_edges: int = 96
-    """Edges kept in the active window; the oldest go first. Source: paper supplement, edge ablation."""
+    """Inter-camera edges kept in the active window; the oldest go first. Source: paper supplement, edge
+    ablation."""
+    st_overlap: float = 0.2
+    """Visible share of the grid that a spatio-temporal edge needs. Source: experiments/tracking_sweep.py."""
+    st_per_frame: int = 2
+    """New inter-camera edges per keyframe and other camera, at most. Source: max_active_edges over the window."""
+    st_separation: int = 4
+    """Frames between two spatio-temporal edges of one keyframe, at least. Source: choice, half an offset-8 edge."""
+    long_range_per_frame: int = 2
+    """Long-range edges of the polish per keyframe to its own camera. Source: experiments/tracking_sweep.py."""
+    long_range_separation: int = 12
+    """Keyframes between the ends of a long-range edge, at least. Source: DESIGN 5 (+-16, +-24 worked)."""
+    polish_per_frame: int = 2
+    """Edges of the polish per keyframe to each other camera. Source: experiments/tracking_sweep.py."""
+    occlusion_tolerance: float = 0.15
+    """Relative depth difference up to which two frames are taken to see one surface. Source: choice."""
+    max_parallax_deg: float = 60.0
+    """Viewing angle at which flow between two frames is no longer tried. Source: choice."""
 
     def __post_init__(self) -> None:
         require(
@@ -76,6 +93,37 @@ class TrackingConfig:
     """Latest frames of the window that are optimised. Source: paper supplement, parameters."""
     depth_prior_lambda: float = 0.005
     """Weight of the depth prior against the flow. Source: paper supplement, parameters (Eq. 4)."""
+    grid_points: int = 768
+    """Grid points per frame, about. Source: DESIGN 5."""
+    keyframe_px: float = 2.0
+    """Mean flow since the last keyframe that makes a new one, px. Source: experiments/tracking_sweep.py (DROID
+    and MegaSAM take 16 to 19 px at full resolution)."""
+    guided_px: float = 16.0
+    """Mean predicted flow beyond which temporal flow is guided by depth and poses, px. Source:
+    experiments/tracking_sweep.py."""
+    robust_px: float = 1.0
+    """Scale of the Cauchy loss on flow residuals, px. Source: DESIGN 5."""
+    noise_px: float = 1.0
+    """Standard deviation of flow of weight one, px. Source: choice; sets the prior's share, not the flow's."""
+    carried_sigma: float = 0.5
+    """Standard deviation of the prior on log depth where the depth was carried over. Source:
+    experiments/tracking_sweep.py."""
+    scale_sigma: float = 0.3
+    """Standard deviation of a keyframe's log depth scale. Source: choice."""
+    start_rotation_deg: float = 0.5
+    """Standard deviation of the start's rotations. Source: the start's own goal."""
+    start_translation: float = 0.03
+    """Standard deviation of the start's positions, in median depths. Source: the start's own goal."""
+    step_iterations: int = 2
+    """iSAM2 updates per time step. Source: experiments/tracking_sweep.py."""
+    polish_rounds: int = 2
+    """Times the polish measures long-range edges and solves. Source: experiments/tracking_sweep.py."""
+    polish_iterations: int = 6
+    """Levenberg-Marquardt iterations per solve of the polish. Source: experiments/tracking_sweep.py."""
+    polish_tolerance: float = 1e-4
+    """Relative decrease of the cost at which a solve of the polish ends. Source: experiments/tracking_sweep.py."""
+    image_cache_mb: int = 256
+    """Memory for frames held or read again. Source: choice, 400 frames of 512x384."""
 
     def __post_init__(self) -> None:
         require(self.window >= 2, f"tracking.window is {self.window}; it must be at least 2")

@@ -1,0 +1,55 @@
+"""The few frames held in memory; older ones are decoded again where the capture allows it."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.graph.connections import Frame
+
+Image = npt.NDArray[np.uint8]
+Read = Callable[[int, int], Image]
+
+
+class ImageStore:
+    """Images by frame, the ones used least recently dropped beyond ``capacity_bytes``."""
+
+    def __init__(self, capacity_bytes: int, read: Read | None = None) -> None:
+        self._capacity = capacity_bytes
+        self.read = read
+        self._images: OrderedDict[Frame, Image] = OrderedDict()
+        self._bytes = 0
+
+    def put(self, frame: Frame, image: Image) -> None:
+        if frame in self._images:
+            self._images.move_to_end(frame)
+            return
+        self._images[frame] = image
+        self._bytes += image.nbytes
+        while self._bytes > self._capacity and len(self._images) > 1:
+            _, dropped = self._images.popitem(last=False)
+            self._bytes -= dropped.nbytes
+
+    def drop(self, frame: Frame) -> None:
+        image = self._images.pop(frame, None)
+        if image is not None:
+            self._bytes -= image.nbytes
+
+    def available(self, frame: Frame) -> bool:
+        """Whether ``get`` can deliver."""
+        return frame in self._images or self.read is not None
+
+    def get(self, frame: Frame) -> Image:
+        """The image. Raises KeyError where it was dropped and cannot be read again."""
+        image = self._images.get(frame)
+        if image is None:
+            if self.read is None:
+                raise KeyError(f"frame {frame} is no longer held and there is nothing to read it from")
+            image = self.read(*frame)
+            self.put(frame, image)
+        else:
+            self._images.move_to_end(frame)
+        return image

@@ -1,0 +1,94 @@
+"""Measuring the flow of connections: plain between close frames, guided by depth and poses otherwise."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+import numpy.typing as npt
+
+from factors.projection import reproject
+from mvdyn_gtsam.config import TrackingConfig
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, sample_pair
+from mvdyn_gtsam.frontend.guided_flow import guided_flow
+from mvdyn_gtsam.geometry import invert_pose
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.tracking.images import ImageStore
+from mvdyn_gtsam.tracking.model import Keyframe, View
+
+Array = npt.NDArray[np.float64]
+
+
+class EdgeMeasurer:
+    """Measures connections between frames whose images the store can deliver."""
+
+    def __init__(
+        self,
+        views: tuple[View, ...],
+        flow: DenseFlow,
+        flow_config: FlowConfig,
+        images: ImageStore,
+        config: TrackingConfig,
+    ) -> None:
+        self._views, self._flow, self._flow_config = views, flow, flow_config
+        self._images, self._config = images, config
+        self._dense: OrderedDict[int, tuple[Array, npt.NDArray[np.float32]]] = OrderedDict()
+
+    def temporal(self, i: Keyframe, j: Keyframe) -> None:
+        """Measure two frames of one camera: guided where the prediction says that the flow is long."""
+        if self.predicted_length(i, j) > self._config.guided_px:
+            self.guided(i, j)
+            return
+        image_i, image_j = self._images.get(i.frame), self._images.get(j.frame)
+        pair = self._flow.measure(image_i, image_j)
+        self._store(i, j, pair, guided=False)
+
+    def guided(self, i: Keyframe, j: Keyframe) -> None:
+        """Measure any two frames around what their depths and poses predict."""
+        view_i, view_j = self._views[i.camera], self._views[j.camera]
+        pair = guided_flow(
+            self._flow,
+            self._images.get(i.frame),
+            self._images.get(j.frame),
+            self._dense_depth(i),
+            self._dense_depth(j),
+            view_i.camera.intrinsics,
+            view_j.camera.intrinsics,
+            invert_pose(j.wTc) @ i.wTc,
+            self._flow_config,
+        )
+        self._store(i, j, pair, guided=True)
+
+    def predicted_length(self, i: Keyframe, j: Keyframe) -> float:
+        """Mean predicted flow between two frames of one camera, px; points behind count as the width."""
+        view = self._views[i.camera]
+        seen = reproject(view.rays, i.log_depth, i.wTc, j.wTc[None], view.intrinsics[None])
+        length = np.linalg.norm(seen.pixels[0] - view.grid.pixels, axis=1)
+        return float(np.mean(np.where(seen.valid[0], np.minimum(length, view.camera.width), view.camera.width)))
+
+    def _store(self, i: Keyframe, j: Keyframe, pair: object, guided: bool) -> None:
+        forward, backward = sample_pair(pair, self._views[i.camera].grid, self._views[j.camera].grid)  # type: ignore[arg-type]
+        i.flows[j.frame], j.flows[i.frame] = forward, backward
+        for a, b in ((i, j), (j, i)):
+            (a.guided.add if guided else a.guided.discard)(b.frame)
+
+    def _dense_depth(self, keyframe: Keyframe) -> npt.NDArray[np.float32]:
+        """``(H, W)`` depth between the grid points; kept while the keyframe's depth stays the same."""
+        kept = self._dense.get(id(keyframe))
+        if kept is not None and kept[0] is keyframe.log_depth:
+            self._dense.move_to_end(id(keyframe))
+            return kept[1]
+        view = self._views[keyframe.camera]
+        dense = np.exp(view.grid.expand(keyframe.log_depth, view.camera.width, view.camera.height))
+        self._dense[id(keyframe)] = (keyframe.log_depth, dense)
+        while len(self._dense) > 40:
+            self._dense.popitem(last=False)
+        return dense
+
+
+def mean_flow(keyframe: Keyframe, to: Frame, view: View) -> float:
+    """Weighted mean length of a measured flow, px; NaN where nothing was measured."""
+    flow = keyframe.flows[to]
+    length = np.linalg.norm(flow.target - view.grid.pixels, axis=1)
+    weight = flow.weight.sum()
+    return float((length * flow.weight).sum() / weight) if weight > 0 else float("nan")

@@ -1,0 +1,151 @@
+"""What tracking keeps and hands on: keyframes, step reports and the result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from factors.measurement import StructurelessMeasurement
+from mvdyn_gtsam.capture.model import Camera
+from mvdyn_gtsam.config import TrackingConfig
+from mvdyn_gtsam.frontend.dense_flow import GridFlow
+from mvdyn_gtsam.frontend.grid import Grid
+from mvdyn_gtsam.geometry import pixel_rays
+from mvdyn_gtsam.graph.connections import EdgeCounts, EdgeKind, Frame
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class View:
+    """What is fixed about one camera: its grid and rays."""
+
+    camera: Camera
+    grid: Grid
+    rays: Array
+    """``(N, 3)`` with z = 1."""
+    intrinsics: Array
+    """``(4,)`` fx fy cx cy, px."""
+
+    @staticmethod
+    def of(camera: Camera, grid_points: int) -> View:
+        """The view whose grid has about ``grid_points`` points."""
+        stride = max(1, round(float(np.sqrt(camera.width * camera.height / grid_points))))
+        grid = Grid.covering(camera.width, camera.height, stride)
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        return View(camera, grid, pixel_rays(grid.pixels, camera.intrinsics), intrinsics)
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """A frame that is a variable of the graph; the tracker updates it in place."""
+
+    camera: int
+    time: int
+    wTc: Array
+    """``(4, 4)``"""
+    log_depth: Array
+    """``(N,)`` latest solution on the grid."""
+    prior_log_depth: Array
+    """``(N,)``"""
+    prior_sigma: Array
+    """``(N,)``"""
+    log_scale: float = 0.0
+    flows: dict[Frame, GridFlow] = field(default_factory=dict)
+    """Flow from this frame to others."""
+    guided: set[Frame] = field(default_factory=set)
+    """Neighbours whose flow was measured with the help of depth and poses, hence can be improved."""
+
+    @property
+    def frame(self) -> Frame:
+        return self.camera, self.time
+
+
+def measurement_of(
+    keyframe: Keyframe,
+    neighbours: list[Frame],
+    views: tuple[View, ...],
+    config: TrackingConfig,
+    steps: int = 4,
+) -> StructurelessMeasurement:
+    """The keyframe's flow to ``neighbours`` as the factor wants it."""
+    flows = [keyframe.flows[frame] for frame in neighbours]
+    return StructurelessMeasurement(
+        rays=views[keyframe.camera].rays,
+        initial_log_depth=keyframe.log_depth,
+        prior_log_depth=keyframe.prior_log_depth,
+        prior_sigma=keyframe.prior_sigma,
+        intrinsics_j=np.stack([views[camera].intrinsics for camera, _ in neighbours]),
+        target=np.stack([flow.target for flow in flows]),
+        weight=np.stack([flow.weight for flow in flows]),
+        robust_px=config.robust_px,
+        noise_px=config.noise_px,
+        steps=steps,
+    )
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one time step did."""
+
+    time: int
+    wTc: Array
+    """``(N, 4, 4)`` pose of every camera, as known now."""
+    keyframes: tuple[bool, ...]
+    """Whether the frame of each camera became a keyframe."""
+    counts: EdgeCounts
+    seconds: float
+
+
+@dataclass(frozen=True)
+class EdgeRecord:
+    """One direction of a connection, and how well it fits at the end."""
+
+    i: Frame
+    j: Frame
+    kind: EdgeKind
+    weight: float
+    """Mean measurement weight over the grid."""
+    median_px: float
+    """Median residual, px."""
+    inlier_fraction: float
+
+
+@dataclass(frozen=True)
+class TrackingResult:
+    """Poses of every frame of every camera, in the world of its group and the start's unit."""
+
+    groups: tuple[tuple[int, ...], ...]
+    wTc: Array
+    """``(N, T, 4, 4)``"""
+    covariance: Array
+    """``(N, T, 6, 6)`` marginal covariance, tangent ``[omega, v]``; for keyframes from the graph, for the others
+    with their keyframes held fixed."""
+    keyframe_times: tuple[tuple[int, ...], ...]
+    """Per camera."""
+    grids: tuple[Grid, ...]
+    """Per camera: where the grid depths are."""
+    log_depth: tuple[npt.NDArray[np.float32], ...]
+    """Per camera ``(K, N_grid)`` log z-depth of its keyframes."""
+    information: tuple[npt.NDArray[np.float32], ...]
+    """Per camera ``(K, N_grid)`` inverse variance of the log depth, poses held fixed."""
+    edges: tuple[EdgeRecord, ...]
+    counts: tuple[EdgeCounts, ...]
+    """Active connections per time step."""
+    seconds: Mapping[str, float]
+    """Time spent per part."""
+
+
+@dataclass(frozen=True)
+class FrameDepth:
+    """Depth of one frame on the grid of its camera."""
+
+    camera: int
+    time: int
+    log_depth: Array
+    """``(N,)`` log z-depth in the unit of the result."""
+    information: Array
+    """``(N,)`` inverse variance of the log depth, poses held fixed."""

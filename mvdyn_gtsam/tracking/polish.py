@@ -1,0 +1,84 @@
+"""The global polish: all keyframes at once, with long-range edges whose flow is measured anew."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from functools import partial
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from factors.keys import S, X
+from mvdyn_gtsam.config import TrackingConfig
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.tracking.keyframe_factor import keyframe_factor
+from mvdyn_gtsam.tracking.model import Keyframe, View, measurement_of
+from mvdyn_gtsam.tracking.window import Priors, solve_depth, useful_neighbours
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PolishSolve:
+    """What one solve did."""
+
+    error_before: float
+    error_after: float
+    iterations: int
+
+
+def solve_all(
+    keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig, priors: Priors
+) -> PolishSolve:
+    """Levenberg-Marquardt over poses and depth scales of all ``keyframes``; they are updated in place."""
+    frames = {keyframe.frame: keyframe for keyframe in keyframes}
+    graph, values = build_graph(keyframes, views, config, priors)
+    parameters = gtsam.LevenbergMarquardtParams()
+    # multifrontal Cholesky calls compressed factors indeterminate where sequential solves them
+    parameters.setLinearSolverType("SEQUENTIAL_CHOLESKY")
+    parameters.setOrderingType("METIS" if len(keyframes) > 400 else "COLAMD")
+    parameters.setMaxIterations(config.polish_iterations)
+    parameters.setRelativeErrorTol(config.polish_tolerance)
+    parameters.setAbsoluteErrorTol(0.0)
+    parameters.setlambdaInitial(1e-6)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+    before = optimizer.error()
+    result = optimizer.optimize()
+    for keyframe in keyframes:
+        keyframe.wTc = result.atPose3(X(*keyframe.frame)).matrix()
+        keyframe.log_scale = result.atDouble(S(*keyframe.frame))
+    for keyframe in keyframes:
+        solve_depth(keyframe, frames, views, config)
+    solve = PolishSolve(before, optimizer.error(), optimizer.iterations())
+    logger.debug("polish: %.1f -> %.1f in %d iterations", *vars(solve).values())
+    return solve
+
+
+def marginal_covariances(
+    keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig, priors: Priors
+) -> dict[Frame, npt.NDArray[np.float64]]:
+    """``(6, 6)`` covariance of every keyframe's pose, tangent ``[omega, v]``."""
+    graph, values = build_graph(keyframes, views, config, priors)
+    marginals = gtsam.Marginals(graph, values)
+    return {keyframe.frame: marginals.marginalCovariance(X(*keyframe.frame)) for keyframe in keyframes}
+
+
+def build_graph(
+    keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig, priors: Priors
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """One structureless factor per keyframe over all it was measured against, and the priors."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    members = {keyframe.frame for keyframe in keyframes}
+    for keyframe in keyframes:
+        values.insert(X(*keyframe.frame), gtsam.Pose3(keyframe.wTc))
+        values.insert(S(*keyframe.frame), keyframe.log_scale)
+        for prior in priors(keyframe):
+            graph.add(prior)
+        neighbours = [frame for frame in useful_neighbours(keyframe) if frame in members]
+        if neighbours:
+            snapshot = replace(keyframe, flows=dict(keyframe.flows))
+            measure = partial(measurement_of, snapshot, neighbours, views, config)
+            graph.add(keyframe_factor(keyframe.frame, neighbours, {}, measure))
+    return graph, values
