@@ -208,9 +208,14 @@ def seeded_flow(
     warped[~seen] = grey_i[~seen]
     residual = flow(grey_i, warped)
     length = cv2.magnitude(residual[..., 0], residual[..., 1])
-    trust = np.exp(-((length / np.float32(config.residual_limit)) ** 2)) * seen
-    seed[~seen] = np.nan_to_num(seed[~seen])
-    return seed + residual, trust.astype(np.float32)
+    # Pixel x looks like the warped image at x + residual, whose own seed is the one to add.
+    seed[~seen] = 0.0
+    at = pixel_raster(grey_i.shape) + residual
+    composed = cv2.remap(seed, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    composed += residual
+    known = cv2.remap(seen.astype(np.float32), at, None, cv2.INTER_LINEAR) > 0.999
+    trust = np.exp(-((length / np.float32(config.residual_limit)) ** 2)) * (known & seen)
+    return composed, trust.astype(np.float32)
 
 
 def forward_backward_weight(
