@@ -56,7 +56,7 @@ class GraphConfig:
     ablation."""
     st_overlap: float = 0.2
     """Visible share of the grid that a spatio-temporal edge needs. Source: experiments/tracking_sweep.py."""
-    st_per_frame: int = 2
+    st_per_frame: int = 1
     """New inter-camera edges per keyframe and other camera, at most. Source: max_active_edges over the window."""
     st_separation: int = 4
     """Frames between two spatio-temporal edges of one keyframe, at least. Source: choice, half an offset-8 edge."""
@@ -120,6 +120,9 @@ class TrackingConfig:
     """Times the polish measures long-range edges and solves. Source: experiments/tracking_sweep.py."""
     polish_iterations: int = 6
     """Levenberg-Marquardt iterations per solve of the polish. Source: experiments/tracking_sweep.py."""
+    remeasure_px: float = 0.3
+    """Median change of a guided flow's prediction beyond which the polish measures it again, px. Source:
+    experiments/tracking_sweep.py."""
     polish_tolerance: float = 1e-4
     """Relative decrease of the cost at which a solve of the polish ends. Source: experiments/tracking_sweep.py."""
     image_cache_mb: int = 256

@@ -9,12 +9,13 @@ import numpy.typing as npt
 
 from factors.projection import reproject
 from mvdyn_gtsam.config import TrackingConfig
-from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, sample_pair
+from mvdyn_gtsam.frontend.dense_depth import upsample_depth
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, FlowPair, sample_pair
 from mvdyn_gtsam.frontend.guided_flow import guided_flow
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.tracking.images import ImageStore
-from mvdyn_gtsam.tracking.model import Keyframe, View
+from mvdyn_gtsam.tracking.model import Guide, Keyframe, View
 
 Array = npt.NDArray[np.float64]
 
@@ -41,11 +42,14 @@ class EdgeMeasurer:
             return
         image_i, image_j = self._images.get(i.frame), self._images.get(j.frame)
         pair = self._flow.measure(image_i, image_j)
-        self._store(i, j, pair, guided=False)
+        self._store(i, j, pair)
+        for a, b in ((i, j), (j, i)):
+            a.guides.pop(b.frame, None)
 
     def guided(self, i: Keyframe, j: Keyframe) -> None:
         """Measure any two frames around what their depths and poses predict."""
         view_i, view_j = self._views[i.camera], self._views[j.camera]
+        jTi = invert_pose(j.wTc) @ i.wTc
         pair = guided_flow(
             self._flow,
             self._images.get(i.frame),
@@ -54,10 +58,28 @@ class EdgeMeasurer:
             self._dense_depth(j),
             view_i.camera.intrinsics,
             view_j.camera.intrinsics,
-            invert_pose(j.wTc) @ i.wTc,
+            jTi,
             self._flow_config,
         )
-        self._store(i, j, pair, guided=True)
+        self._store(i, j, pair)
+        i.guides[j.frame] = Guide(i.log_depth, jTi)
+        j.guides[i.frame] = Guide(j.log_depth, invert_pose(jTi))
+
+    def outdated(self, i: Keyframe, j: Keyframe) -> bool:
+        """Whether depth and poses now predict another flow than the one it was guided by."""
+        return max(self._change(i, j), self._change(j, i)) > self._config.remeasure_px
+
+    def _change(self, i: Keyframe, j: Keyframe) -> float:
+        guide = i.guides[j.frame]
+        view_i, intrinsics = self._views[i.camera], self._views[j.camera].intrinsics[None]
+        used = i.flows[j.frame].weight > 0.0
+        if not used.any():
+            return float("inf")
+        identity = np.eye(4)
+        before = reproject(view_i.rays[used], guide.log_depth[used], guide.jTi, identity[None], intrinsics)
+        jTi = invert_pose(j.wTc) @ i.wTc
+        now = reproject(view_i.rays[used], i.log_depth[used], jTi, identity[None], intrinsics)
+        return float(np.median(np.linalg.norm(now.pixels[0] - before.pixels[0], axis=1)))
 
     def predicted_length(self, i: Keyframe, j: Keyframe) -> float:
         """Mean predicted flow between two frames of one camera, px; points behind count as the width."""
@@ -66,20 +88,19 @@ class EdgeMeasurer:
         length = np.linalg.norm(seen.pixels[0] - view.grid.pixels, axis=1)
         return float(np.mean(np.where(seen.valid[0], np.minimum(length, view.camera.width), view.camera.width)))
 
-    def _store(self, i: Keyframe, j: Keyframe, pair: object, guided: bool) -> None:
-        forward, backward = sample_pair(pair, self._views[i.camera].grid, self._views[j.camera].grid)  # type: ignore[arg-type]
+    def _store(self, i: Keyframe, j: Keyframe, pair: FlowPair) -> None:
+        forward, backward = sample_pair(pair, self._views[i.camera].grid, self._views[j.camera].grid)
         i.flows[j.frame], j.flows[i.frame] = forward, backward
-        for a, b in ((i, j), (j, i)):
-            (a.guided.add if guided else a.guided.discard)(b.frame)
 
     def _dense_depth(self, keyframe: Keyframe) -> npt.NDArray[np.float32]:
-        """``(H, W)`` depth between the grid points; kept while the keyframe's depth stays the same."""
+        """``(H, W)`` depth along the image's edges; kept while the keyframe's depth stays the same."""
         kept = self._dense.get(id(keyframe))
         if kept is not None and kept[0] is keyframe.log_depth:
             self._dense.move_to_end(id(keyframe))
             return kept[1]
         view = self._views[keyframe.camera]
-        dense = np.exp(view.grid.expand(keyframe.log_depth, view.camera.width, view.camera.height))
+        image = self._images.get(keyframe.frame)
+        dense, _ = upsample_depth(image, view.grid, np.exp(keyframe.log_depth), np.ones(len(view.grid)))
         self._dense[id(keyframe)] = (keyframe.log_depth, dense)
         while len(self._dense) > 40:
             self._dense.popitem(last=False)

@@ -29,6 +29,8 @@ class View:
     """``(N, 3)`` with z = 1."""
     intrinsics: Array
     """``(4,)`` fx fy cx cy, px."""
+    checkerboard: npt.NDArray[np.int64]
+    """Indices of every second grid point."""
 
     @staticmethod
     def of(camera: Camera, grid_points: int) -> View:
@@ -36,7 +38,19 @@ class View:
         stride = max(1, round(float(np.sqrt(camera.width * camera.height / grid_points))))
         grid = Grid.covering(camera.width, camera.height, stride)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        return View(camera, grid, pixel_rays(grid.pixels, camera.intrinsics), intrinsics)
+        rows, cols = np.indices(grid.shape)
+        checkerboard = np.flatnonzero(((rows + cols) % 2 == 0).ravel())
+        return View(camera, grid, pixel_rays(grid.pixels, camera.intrinsics), intrinsics, checkerboard)
+
+
+@dataclass(frozen=True)
+class Guide:
+    """Depth and relative pose that a guided flow was measured around."""
+
+    log_depth: Array
+    """``(N,)`` of frame i."""
+    jTi: Array
+    """``(4, 4)``"""
 
 
 @dataclass(eq=False)
@@ -56,8 +70,8 @@ class Keyframe:
     log_scale: float = 0.0
     flows: dict[Frame, GridFlow] = field(default_factory=dict)
     """Flow from this frame to others."""
-    guided: set[Frame] = field(default_factory=set)
-    """Neighbours whose flow was measured with the help of depth and poses, hence can be improved."""
+    guides: dict[Frame, Guide] = field(default_factory=dict)
+    """What the flow to a neighbour was guided by; neighbours measured without guidance have no entry."""
 
     @property
     def frame(self) -> Frame:
@@ -70,17 +84,23 @@ def measurement_of(
     views: tuple[View, ...],
     config: TrackingConfig,
     steps: int = 4,
+    thin: bool = False,
 ) -> StructurelessMeasurement:
-    """The keyframe's flow to ``neighbours`` as the factor wants it."""
+    """The keyframe's flow to ``neighbours`` as the factor wants it.
+
+    ``thin`` takes every second grid point, as on a checkerboard.
+    """
+    view = views[keyframe.camera]
     flows = [keyframe.flows[frame] for frame in neighbours]
+    points = view.checkerboard if thin else slice(None)
     return StructurelessMeasurement(
-        rays=views[keyframe.camera].rays,
-        initial_log_depth=keyframe.log_depth,
-        prior_log_depth=keyframe.prior_log_depth,
-        prior_sigma=keyframe.prior_sigma,
+        rays=view.rays[points],
+        initial_log_depth=keyframe.log_depth[points],
+        prior_log_depth=keyframe.prior_log_depth[points],
+        prior_sigma=keyframe.prior_sigma[points],
         intrinsics_j=np.stack([views[camera].intrinsics for camera, _ in neighbours]),
-        target=np.stack([flow.target for flow in flows]),
-        weight=np.stack([flow.weight for flow in flows]),
+        target=np.stack([flow.target[points] for flow in flows]),
+        weight=np.stack([flow.weight[points] for flow in flows]),
         robust_px=config.robust_px,
         noise_px=config.noise_px,
         steps=steps,

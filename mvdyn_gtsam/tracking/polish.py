@@ -30,11 +30,18 @@ class PolishSolve:
 
 
 def solve_all(
-    keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig, priors: Priors
+    keyframes: list[Keyframe],
+    views: tuple[View, ...],
+    config: TrackingConfig,
+    priors: Priors,
+    thin: bool = False,
 ) -> PolishSolve:
-    """Levenberg-Marquardt over poses and depth scales of all ``keyframes``; they are updated in place."""
+    """Levenberg-Marquardt over poses and depth scales of all ``keyframes``; they are updated in place.
+
+    ``thin`` uses every second grid point: enough between two rounds of measuring.
+    """
     frames = {keyframe.frame: keyframe for keyframe in keyframes}
-    graph, values = build_graph(keyframes, views, config, priors)
+    graph, values = build_graph(keyframes, views, config, priors, thin)
     parameters = gtsam.LevenbergMarquardtParams()
     # multifrontal Cholesky calls compressed factors indeterminate where sequential solves them
     parameters.setLinearSolverType("SEQUENTIAL_CHOLESKY")
@@ -66,7 +73,11 @@ def marginal_covariances(
 
 
 def build_graph(
-    keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig, priors: Priors
+    keyframes: list[Keyframe],
+    views: tuple[View, ...],
+    config: TrackingConfig,
+    priors: Priors,
+    thin: bool = False,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """One structureless factor per keyframe over all it was measured against, and the priors."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -79,6 +90,6 @@ def build_graph(
         neighbours = [frame for frame in useful_neighbours(keyframe) if frame in members]
         if neighbours:
             snapshot = replace(keyframe, flows=dict(keyframe.flows))
-            measure = partial(measurement_of, snapshot, neighbours, views, config)
+            measure = partial(measurement_of, snapshot, neighbours, views, config, thin=thin)
             graph.add(keyframe_factor(keyframe.frame, neighbours, {}, measure))
     return graph, values

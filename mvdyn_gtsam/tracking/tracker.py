@@ -122,7 +122,7 @@ class Tracker:
         # only a stand-in until flow says better: where the flow is guided, the depth must belong to this view
         self._measurer.temporal(last, frame)
         self._locate(frame, [last], predictions)
-        if frame.frame in last.guided:
+        if frame.frame in last.guides:
             self._carry_depth(frame, last)
             self._measurer.guided(last, frame)
             self._locate(frame, [last], [frame.wTc, *predictions])
@@ -207,16 +207,17 @@ class Tracker:
         self._forget_candidates(frame)
         touched[frame.frame] = frame
         edges: list[Edge] = []
-        for offset in self._graph_config.temporal_offsets:
-            if offset > len(track):
-                continue
+        offsets = [offset for offset in self._graph_config.temporal_offsets if offset <= len(track)]
+        for offset in offsets:
             other = track[-offset]
             if not self._images.available(other.frame):
                 continue
             edges.append(Edge(frame.frame, other.frame, EdgeKind.TEMPORAL))
             if frame.frame not in other.flows:
                 self._measurer.temporal(other, frame)
-            touched[other.frame] = other
+            # each renewal takes in all flow gathered since the last: early for depth, late for completeness
+            if offset in (offsets[0], self._graph_config.temporal_offsets[-1]):
+                touched[other.frame] = other
         track.append(frame)
         self._frames[frame.frame] = frame
         self._add_edges(edges)
@@ -229,7 +230,7 @@ class Tracker:
             for other in [key for key in last.flows if key not in self._frames and key != frame.frame]:
                 del last.flows[other]
 
-    def _connect_cameras(self, new: Sequence[Keyframe], touched: dict[Frame, Keyframe]) -> None:
+    def _connect_cameras(self, new: Sequence[Keyframe]) -> None:
         for frame in new:
             for camera, track in enumerate(self._tracks):
                 if camera == frame.camera or self._group_of[camera] != self._group_of[frame.camera]:
@@ -241,8 +242,6 @@ class Tracker:
                 for edge in edges:
                     other = self._frames[edge.j]
                     self._measurer.guided(frame, other)
-                    touched[other.frame] = other
-                    touched[frame.frame] = frame
                 self._add_edges(edges)
 
     def _add_edges(self, edges: Sequence[Edge]) -> None:
@@ -254,7 +253,7 @@ class Tracker:
         if not new:
             return
         began = perf_counter()
-        self._connect_cameras(new, touched)
+        self._connect_cameras(new)
         self._time("inter-camera", began)
         began = perf_counter()
         self._window.update(new, list(touched.values()), self._frames)
@@ -303,7 +302,8 @@ class Tracker:
                 self._remeasure(add=polish_round == 1)
                 self._time("polish measure", began)
             began = perf_counter()
-            solve_all(keyframes, self._views, self._tracking, self._priors)
+            last = polish_round == self._tracking.polish_rounds
+            solve_all(keyframes, self._views, self._tracking, self._priors, thin=not last)
             self._time("polish solve", began)
 
     def _remeasure(self, add: bool) -> None:
@@ -316,8 +316,9 @@ class Tracker:
         for frames in ordered:
             j, i = sorted(frames, key=lambda frame: frame[::-1])
             first, second = self._frames[i], self._frames[j]
-            new = j not in first.flows
-            if (new or j in first.guided) and self._images.available(i) and self._images.available(j):
+            if j in first.flows and (j not in first.guides or not self._measurer.outdated(first, second)):
+                continue
+            if self._images.available(i) and self._images.available(j):
                 self._measurer.guided(first, second)
 
     def _polish_edges(self, keyframe: Keyframe) -> list[Edge]:

@@ -102,13 +102,13 @@ class SlidingWindow:
         self._read_back(renewed, all_frames)
 
     def _factor(self, keyframe: Keyframe, all_frames: dict[Frame, Keyframe]) -> gtsam.CustomFactor | None:
-        neighbours = useful_neighbours(keyframe)
+        neighbours = [frame for frame in useful_neighbours(keyframe) if frame in all_frames]
         if not neighbours:
             return None
         fixed = {frame: all_frames[frame].wTc for frame in neighbours if frame not in self._members}
         # a factor must not change: its flows and the start of its depths are those of now
         snapshot = replace(keyframe, flows=dict(keyframe.flows))
-        measure = partial(measurement_of, snapshot, neighbours, self._views, self._config)
+        measure = partial(measurement_of, snapshot, neighbours, self._views, self._config, thin=True)
         return keyframe_factor(keyframe.frame, neighbours, fixed, measure)
 
     def _settled_keys(self) -> gtsam.KeyList:

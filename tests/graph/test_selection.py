@@ -1,0 +1,96 @@
+"""Predicted overlap and the choice of whom to connect."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mvdyn_gtsam.geometry import pixel_rays
+from mvdyn_gtsam.graph.selection import Overlap, View, choose_spread, edge_score, predicted_overlap
+
+WIDTH, HEIGHT, STRIDE, FOCAL = 160, 120, 10, 150.0
+K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1.0]])
+INTRINSICS = np.array([FOCAL, FOCAL, K[0, 2], K[1, 2]])
+SHAPE = (HEIGHT // STRIDE, WIDTH // STRIDE)
+ORIGIN = (5.0, 5.0)
+
+
+def wall_points(depth: float) -> np.ndarray:
+    x, y = np.meshgrid(ORIGIN[0] + STRIDE * np.arange(SHAPE[1]), ORIGIN[1] + STRIDE * np.arange(SHAPE[0]))
+    return pixel_rays(np.stack([x, y], -1).reshape(-1, 2), K) * depth
+
+
+def view(translation=(0.0, 0.0, 0.0), depth: float = 4.0, wRc=None) -> View:
+    wTc = np.eye(4)
+    wTc[:3, 3] = translation
+    if wRc is not None:
+        wTc[:3, :3] = wRc
+    return View(wTc, INTRINSICS, (WIDTH, HEIGHT), np.full(SHAPE, depth), ORIGIN, STRIDE)
+
+
+def overlap_with(*views: View, depth: float = 4.0) -> Overlap:
+    return predicted_overlap(wall_points(depth), np.zeros(3), views, occlusion_tolerance=0.1)
+
+
+def test_the_same_view_sees_everything_without_parallax():
+    overlap = overlap_with(view())
+    assert overlap.inside[0] == overlap.visible[0] == 1.0
+    assert overlap.parallax_deg[0] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_a_shift_by_a_quarter_of_the_view_leaves_three_quarters():
+    shift = 0.25 * WIDTH * 4.0 / FOCAL
+    overlap = overlap_with(view((shift, 0, 0)))
+    assert overlap.inside[0] == pytest.approx(0.75, abs=1.0 / SHAPE[1])
+    assert overlap.parallax_deg[0] == pytest.approx(np.degrees(np.arctan2(shift, 4.0)), rel=0.15)
+
+
+def test_points_hidden_behind_something_are_inside_but_not_visible():
+    overlap = overlap_with(view(depth=2.0))
+    assert overlap.inside[0] == 1.0
+    assert overlap.visible[0] == 0.0
+
+
+def test_points_behind_the_camera_are_outside():
+    turned = np.diag([-1.0, 1.0, -1.0])
+    overlap = overlap_with(view(wRc=turned))
+    assert overlap.inside[0] == 0.0
+    assert edge_score(overlap, 0.0, 60.0)[0] == 0.0
+
+
+def test_score_needs_the_minimum_and_fades_with_the_angle():
+    overlap = Overlap(np.ones(4), np.array([0.1, 0.5, 0.5, 0.5]), np.array([0.0, 0.0, 30.0, 60.0]))
+    score = edge_score(overlap, minimum=0.2, max_parallax_deg=60.0)
+    assert score[0] == 0.0
+    assert score[1] == 0.5
+    assert score[1] > score[2] > score[3] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_choice_takes_the_best_and_keeps_them_apart():
+    times = np.arange(20)
+    score = np.where(times == 10, 1.0, 0.5 - 0.01 * abs(times - 10))
+    assert [int(times[k]) for k in choose_spread(score, times, separation=4, count=3)] == [10, 14, 6]
+
+
+def test_choice_keeps_away_from_what_is_taken_and_skips_what_scores_nothing():
+    times = np.arange(10)
+    score = np.where(times >= 8, 1.0, 0.0)
+    assert choose_spread(score, times, separation=3, count=5, taken=[9]) == []
+    assert choose_spread(score, times, separation=3, count=5) == [9]
+
+
+@given(
+    st.lists(st.tuples(st.floats(0, 1), st.integers(0, 50)), min_size=1, max_size=40),
+    st.integers(1, 8),
+    st.integers(0, 6),
+)
+def test_choice_is_spread_and_maximal(raw, separation, count):
+    score, times = np.array([s for s, _ in raw]), np.array([t for _, t in raw])
+    chosen = choose_spread(score, times, separation, count)
+    assert len(chosen) <= count
+    for a in chosen:
+        assert score[a] > 0
+        assert all(a == b or abs(times[a] - times[b]) >= separation for b in chosen)
+    if len(chosen) < count:  # then every other candidate is too close to a chosen one
+        for k in np.flatnonzero(score > 0):
+            assert any(abs(times[k] - times[c]) < separation for c in chosen)
