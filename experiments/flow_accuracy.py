@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import operator
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,8 @@ Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 
+KINDS = ("+1", "+2", "+4", "+8", "+16", "guided+10", "guided+20", "cross+0", "cross+10")
+"""Frame distances: within a camera without help, guided within a camera, guided to another camera."""
 BLOCK = 32
 WEIGHT_BINS = (0.0, 0.2, 0.5, 0.8, 1.01)
 
@@ -78,33 +81,27 @@ class Score:
     """Length of the weighted mean error vector."""
     calibration: tuple[float, ...]
     """Median error per weight bin."""
-    milliseconds: float
+    cpu_ms: float
+    """Both directions, all threads."""
 
 
-def load_cases(folder: Path, distances: Iterable[int], times: int, condition: str) -> Iterator[Case]:
-    """Cases of one capture; ``times`` source frames per camera, spread evenly."""
+def load_cases(folder: Path, times: int, condition: str, kinds: Collection[str] = KINDS) -> Iterator[Case]:
+    """Cases of one capture, ``times`` source frames per camera spread evenly."""
     capture, truth = load_capture(folder), load_groundtruth(folder / "groundtruth")
     rng = np.random.default_rng(0)
     names = [camera.name for camera in capture.cameras]
     for i, name in enumerate(names):
         frames = truth.depth_frames(name)
-        chosen = [frames[k] for k in np.linspace(0, len(frames) - 1, times + 1).astype(int)[:-1]]
-        for t in chosen:
-            for distance in distances:
-                if t + distance < capture.frame_count:
-                    yield _case(capture, truth, (i, t), (i, t + distance), f"+{distance}", condition, rng)
-            for distance in (10, 20):
-                if t + distance in frames:
-                    key = (i, t), (i, t + distance)
-                    yield _case(capture, truth, *key, f"guided+{distance}", condition, rng)
-            for j in range(len(names)):
-                for distance in (0, 10):
-                    if j != i and t + distance in frames:
-                        case = _case(
-                            capture, truth, (i, t), (j, t + distance), f"cross+{distance}", condition, rng
-                        )
-                        if np.isfinite(case.truth[..., 0]).mean() > 0.1:
-                            yield case
+        for t in (frames[k] for k in np.linspace(0, len(frames) - 1, times + 1).astype(int)[:-1]):
+            for kind in kinds:
+                prefix, _, distance = kind.rpartition("+")
+                u = t + int(distance)
+                others = [j for j in range(len(names)) if j != i] if prefix == "cross" else [i]
+                known = u in frames if prefix else u < capture.frame_count
+                for j in others if known else []:
+                    case = _case(capture, truth, (i, t), (j, u), kind, condition, rng)
+                    if np.isfinite(case.truth[..., 0]).mean() > 0.1:
+                        yield case
 
 
 def _case(
@@ -173,7 +170,7 @@ class Variant:
 
 def measure(variant: Variant, case: Case) -> Score:
     flow = variant.make(variant.config)
-    start = time.perf_counter()
+    start = time.process_time()
     if case.guided:
         pair: FlowPair = guided_flow(
             flow, case.image_i, case.image_j, case.perturbed_depth_i, case.perturbed_depth_j,
@@ -181,18 +178,18 @@ def measure(variant: Variant, case: Case) -> Score:
         )  # fmt: skip
     else:
         pair = flow.measure(case.image_i, case.image_j)
-    elapsed = 1e3 * (time.perf_counter() - start)
+    elapsed = 1e3 * (time.process_time() - start)
     return score(pair.forward, pair.forward_weight, case.truth, elapsed)
 
 
-def score(flow: Float32, weight: Float32, truth: Float32, milliseconds: float) -> Score:
+def score(flow: Float32, weight: Float32, truth: Float32, cpu_ms: float) -> Score:
     error = flow - truth
     length = np.linalg.norm(error, axis=2)
     known = np.isfinite(length)
     trusted = known & (weight > 0.5)
     if trusted.sum() < 50:
         return Score(math.nan, math.nan, float(trusted.sum() / max(known.sum(), 1)), math.nan, math.nan,
-                     math.nan, (math.nan,) * (len(WEIGHT_BINS) - 1), milliseconds)  # fmt: skip
+                     math.nan, (math.nan,) * (len(WEIGHT_BINS) - 1), cpu_ms)  # fmt: skip
     # The solver's robust loss would discount the outliers as well.
     robust = np.where(known, weight / (1.0 + np.nan_to_num(length) ** 2), 0.0).astype(np.float64)
     weighted = np.nan_to_num(error) * robust[..., None]
@@ -211,7 +208,7 @@ def score(flow: Float32, weight: Float32, truth: Float32, milliseconds: float) -
         float(np.sqrt((means**2).sum(axis=1).mean())) if len(means) else math.nan,
         float(np.linalg.norm(weighted.sum(axis=(0, 1)) / robust.sum())),
         tuple(float(np.median(length[pick])) if pick.any() else math.nan for pick in bins),
-        milliseconds,
+        cpu_ms,
     )
 
 
@@ -224,6 +221,7 @@ def _blocks(values: Array) -> Array:
 def sweeps() -> dict[str, list[Variant]]:
     """Named lists of variants; each starts with the default."""
     base = FlowConfig()
+    medium = {"finest_scale": 2, "patch_stride": 4, "gradient_iterations": 16, "variational_iterations": 5}
 
     def settings(**changes: Any) -> Variant:
         return Variant(
@@ -233,25 +231,23 @@ def sweeps() -> dict[str, list[Variant]]:
     return {
         "default": [settings()],
         "dis": [
-            settings(finest_scale=2),
+            settings(),
+            Variant("OpenCV medium", replace(base, **medium)),
+            Variant("OpenCV medium, finest_scale=1", replace(base, **{**medium, "finest_scale": 1})),
             settings(finest_scale=1),
-            settings(finest_scale=0),
-            settings(finest_scale=1, variational_iterations=0),
-            settings(finest_scale=1, variational_iterations=10),
-            settings(finest_scale=0, variational_iterations=0),
-            settings(finest_scale=1, patch_size=12),
-            settings(finest_scale=1, patch_size=12, patch_stride=6),
-            settings(finest_scale=1, patch_stride=3, gradient_iterations=25),
+            settings(patch_stride=4),
+            settings(gradient_iterations=8),
+            settings(patch_size=12, patch_stride=8),
+            settings(variational_iterations=1),
         ],
         "weights": [
             settings(),
             settings(forward_backward_sigma=0.35),
-            settings(forward_backward_sigma=1.0),
-            settings(border_margin=0),
-            settings(border_margin=8),
-            settings(ncc_window=7),
+            settings(forward_backward_sigma=0.7),
             settings(ncc_low=0.3, ncc_high=0.7),
+            settings(ncc_window=7),
             settings(ncc_noise=4.0),
+            settings(border_margin=6),
         ],
     }
 
@@ -264,14 +260,18 @@ def table(results: dict[str, list[tuple[Case, Score]]], by: str) -> list[str]:
     for variant, pairs in results.items():
         for group in sorted({getattr(case, by) for case, _ in pairs}, key=_order) + ["all"]:
             picked = [(case, s) for case, s in pairs if group in ("all", getattr(case, by))]
-            values = [_scene_mean(picked, lambda s, n=name: getattr(s, n)) for name in names]
-            bins = [_scene_mean(picked, lambda s, k=k: s.calibration[k]) for k in range(len(WEIGHT_BINS) - 1)]
+            values = [_scene_mean(picked, operator.attrgetter(name)) for name in names]
+            bins = [_scene_mean(picked, _bin_of(k)) for k in range(len(WEIGHT_BINS) - 1)]
             cells = [f"{value:.3f}" if value < 10 else f"{value:.0f}" for value in values]
             lines.append(
                 f"| {variant} | {group} | {len(picked)} | " + " | ".join(cells) + " | "
                 + " ".join(f"{value:.2f}" for value in bins) + " |"
             )  # fmt: skip
     return lines
+
+
+def _bin_of(index: int) -> Callable[[Score], float]:
+    return lambda score: score.calibration[index]
 
 
 def _scene_mean(picked: list[tuple[Any, Score]], value: Callable[[Score], float]) -> float:
@@ -294,7 +294,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("captures", nargs="+", type=Path, help="rendered captures with groundtruth/depth")
     parser.add_argument("--sweep", choices=sorted(sweeps()), default="default")
-    parser.add_argument("--distances", type=int, nargs="*", default=[1, 2, 4, 8, 16])
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--times", type=int, default=3, help="source frames per camera")
     parser.add_argument("--condition", choices=["clean", "exposure", "blur"], default="clean",
                         help="what is done to every second image")  # fmt: skip
@@ -304,7 +304,7 @@ def main(arguments: list[str] | None = None) -> int:
     variants = sweeps()[options.sweep]
     results: dict[str, list[tuple[Case, Score]]] = {variant.name: [] for variant in variants}
     for folder in options.captures:
-        for case in load_cases(folder, options.distances, options.times, options.condition):
+        for case in load_cases(folder, options.times, options.condition, options.kinds):
             light = replace(case, **{f.name: None for f in fields(Case) if f.name not in ("scene", "kind")})  # type: ignore[arg-type]
             for variant in variants:
                 results[variant.name].append((light, measure(variant, case)))

@@ -63,13 +63,13 @@ def interpolate_sparse_depth(
         usable &= (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < width - 0.5) & (pixels[:, 1] < height - 0.5)
     if not usable.any():
         raise ValueError("no sparse point with a positive depth lies inside the image")
-    pixels, inverse = pixels[usable], 1.0 / depth[usable]
-    kept = _like_their_neighbours(pixels, inverse)
-    pixels, inverse = pixels[kept], inverse[kept]
-    values = _triangulated(pixels, inverse, width, height)
+    points, inverse = pixels[usable].astype(np.float64), 1.0 / depth[usable].astype(np.float64)
+    kept = _like_their_neighbours(points, inverse)
+    points, inverse = points[kept], inverse[kept]
+    values = _triangulated(points, inverse, width, height)
     if values is None:
         raster = pixel_raster((height, width)).reshape(-1, 2)
-        values = inverse[cKDTree(pixels).query(raster)[1]].reshape(height, width).astype(np.float32)
+        values = inverse[cKDTree(points).query(raster)[1]].reshape(height, width).astype(np.float32)
     known = np.isfinite(values).astype(np.float32)
     return 1.0 / _filled(np.nan_to_num(values), known)
 

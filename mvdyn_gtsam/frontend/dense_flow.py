@@ -25,18 +25,20 @@ REMAP_STEP = 1.0 / 32.0
 class FlowConfig:
     """Dense flow and its weights."""
 
-    finest_scale: int = 1
-    """Pyramid level DIS stops at; 0 is full resolution. Source: experiments/flow_accuracy.py."""
+    finest_scale: int = 0
+    """Pyramid level DIS stops at; 0 is full resolution. Source: experiments/results/flow_accuracy.md."""
     patch_size: int = 8
-    """DIS patch, px. Source: experiments/flow_accuracy.py."""
-    patch_stride: int = 4
-    """Distance between DIS patches, px. Source: experiments/flow_accuracy.py."""
-    gradient_iterations: int = 16
-    """Gradient-descent steps per DIS patch. Source: OpenCV, medium preset."""
-    variational_iterations: int = 5
-    """Fixed-point iterations of the variational refinement per level. Source: OpenCV, medium preset."""
-    forward_backward_sigma: float = 0.7
-    """Weight is exp(-(forward-backward error / sigma)^2), px. Source: measured (DESIGN 5)."""
+    """DIS patch, px. Source: experiments/results/flow_accuracy.md."""
+    patch_stride: int = 6
+    """Distance between DIS patches, px. Source: experiments/results/flow_accuracy.md."""
+    gradient_iterations: int = 12
+    """Gradient-descent steps per DIS patch. Source: experiments/results/flow_accuracy.md."""
+    variational_iterations: int = 0
+    """Fixed-point iterations of the variational refinement per level; its smoothness lowers the error of
+    single points but makes neighbours wrong together. Source: experiments/results/flow_accuracy.md."""
+    forward_backward_sigma: float = 0.5
+    """Weight is exp(-(forward-backward error / sigma)^2), px. Source:
+    experiments/results/flow_accuracy.md."""
     border_margin: int = 2
     """Points and targets closer than this to an image border get no weight, px. Source: choice."""
     residual_limit: float = 20.0

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mvdyn_gtsam.frontend.depth_prior import NoDepthPrior, ScaleOffset, align_scale_offset
+from mvdyn_gtsam.frontend.depth_prior import DepthPrior, NoDepthPrior, ScaleOffset, align_scale_offset
 
 
 def _depths(seed: int, frames: int = 3) -> list[np.ndarray]:
@@ -65,4 +65,5 @@ def test_applying_marks_what_falls_behind_the_camera() -> None:
 
 
 def test_the_default_has_no_opinion() -> None:
-    assert NoDepthPrior().predict(np.zeros((4, 4, 3), np.uint8), np.eye(3)) is None
+    prior: DepthPrior = NoDepthPrior()
+    assert prior.predict(np.zeros((4, 4, 3), np.uint8), np.eye(3)) is None
