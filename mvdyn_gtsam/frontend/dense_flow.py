@@ -201,23 +201,29 @@ def seeded_flow(
 
     The trust is 0 where the seed is NaN or leaves image j, and falls with the length of the residual.
     """
-    seed = np.round(seed / REMAP_STEP) * np.float32(REMAP_STEP)
-    target = pixel_raster(grey_i.shape) + seed
-    seen = inside(target, grey_j.shape, 0)
-    target[~seen] = -1.0
+    seed = np.multiply(seed, np.float32(1.0 / REMAP_STEP), dtype=np.float32)
+    np.rint(seed, out=seed)
+    seed *= np.float32(REMAP_STEP)
+    raster = pixel_raster(grey_i.shape)
+    target = raster + seed
+    unseen = ~inside(target, grey_j.shape, 0)
+    target[unseen] = -1.0
     warped = cv2.remap(grey_j, target, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     # Where nothing is known the image itself stands in: no residual there, and no false edges.
-    warped[~seen] = grey_i[~seen]
+    np.copyto(warped, grey_i, where=unseen)
     residual = flow(grey_i, warped)
-    length = cv2.magnitude(residual[..., 0], residual[..., 1])
-    # Pixel x looks like the warped image at x + residual, whose own seed is the one to add.
-    seed[~seen] = 0.0
-    at = pixel_raster(grey_i.shape) + residual
-    composed = cv2.remap(seed, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    # Pixel x looks like the warped image at x + residual, whose own seed is the one to add; NaN spreads.
+    seed[unseen] = np.nan
+    raster += residual
+    composed = cv2.remap(seed, raster, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    np.logical_or(unseen, np.isnan(composed[..., 0]), out=unseen)
+    composed[unseen] = 0.0
     composed += residual
-    known = cv2.remap(seen.astype(np.float32), at, None, cv2.INTER_LINEAR) > 0.999
-    trust = np.exp(-((length / np.float32(config.residual_limit)) ** 2)) * (known & seen)
-    return composed, trust.astype(np.float32)
+    squared = residual[..., 0] ** 2 + residual[..., 1] ** 2
+    squared *= np.float32(-1.0 / config.residual_limit**2)
+    trust = np.exp(squared, out=squared)
+    trust[unseen] = 0.0
+    return composed, trust
 
 
 def forward_backward_weight(

@@ -38,9 +38,7 @@ def predicted_flow(
 
     NaN where the depth is invalid or the point is behind camera j or outside its image ``(H_j, W_j)``.
     """
-    flow, _ = _project(depth_i, intrinsics_i, intrinsics_j, jTi)
-    flow[~inside(flow + pixel_raster(flow.shape), shape_j, 0)] = np.nan
-    return flow
+    return _predict(depth_i, intrinsics_i, intrinsics_j, jTi, shape_j)[0]
 
 
 def guided_flow(
@@ -61,11 +59,9 @@ def guided_flow(
     """
     grey_i, grey_j = to_grey(image_i), to_grey(image_j)
     iTj = invert_pose(jTi)
-    seed = predicted_flow(depth_i, intrinsics_i, intrinsics_j, jTi, grey_j.shape)
-    seed_backward = predicted_flow(depth_j, intrinsics_j, intrinsics_i, iTj, grey_i.shape)
+    seed, forward_depth = _predict(depth_i, intrinsics_i, intrinsics_j, jTi, grey_j.shape)
+    seed_backward, backward_depth = _predict(depth_j, intrinsics_j, intrinsics_i, iTj, grey_i.shape)
     pair = flow.measure(grey_i, grey_j, seed, seed_backward)
-    forward_depth = _transformed_depth(depth_i, intrinsics_i, jTi)
-    backward_depth = _transformed_depth(depth_j, intrinsics_j, iTj)
     return FlowPair(
         pair.forward,
         pair.backward,
@@ -127,6 +123,19 @@ def occlusion_weight(
     return weight
 
 
+def _predict(
+    depth_i: npt.NDArray[np.floating],
+    intrinsics_i: Array,
+    intrinsics_j: Array,
+    jTi: Array,
+    shape_j: tuple[int, ...],
+) -> tuple[Float32, Float32]:
+    """The predicted flow, and the depth ``(H_i, W_i)`` of its points in camera j."""
+    flow, depth = _project(depth_i, intrinsics_i, intrinsics_j, jTi)
+    flow[~inside(flow + pixel_raster(flow.shape), shape_j, 0)] = np.nan
+    return flow, depth
+
+
 def _project(
     depth_i: npt.NDArray[np.floating], intrinsics_i: Array, intrinsics_j: Array, jTi: Array
 ) -> tuple[Float32, Float32]:
@@ -151,7 +160,3 @@ def _project(
     flow[..., 0] = component(0) * inverse - x.astype(np.float32)
     flow[..., 1] = component(1) * inverse - y.astype(np.float32)
     return flow, depth_j
-
-
-def _transformed_depth(depth_i: npt.NDArray[np.floating], intrinsics_i: Array, jTi: Array) -> Float32:
-    return _project(depth_i, intrinsics_i, intrinsics_i, jTi)[1]
