@@ -6,13 +6,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, median_filter
 
 from mvdyn_gtsam.frontend.dense_flow import GridFlow
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.geometry import backproject, invert_pose, transform_points
 
 Array = npt.NDArray[np.float64]
+
+LIKE_LOG_DEPTH = 0.1
+"""Difference of log depth within which neighbours are taken for one surface."""
 
 
 def sparse_log_depth(pixels: Array, depth: Array, grid: Grid) -> Array:
@@ -55,6 +58,29 @@ def carried_log_depth(
         return np.full(len(z), np.median(source_log_depth)), carried
     log_depth = np.log(np.where(carried, z, 1.0))
     return fill(log_depth, carried, grid), carried
+
+
+def smoothed_log_depth(log_depth: Array, information: Array, grid: Grid) -> Array:
+    """Log depth ``(N,)`` averaged over 5 x 5 grid points by information, nearness and likeness.
+
+    Bilateral around the 3 x 3 median: noise of single points would tear the images that guided flow warps,
+    while an average across depth edges would bend them.
+    """
+    rows, cols = grid.shape
+    table = log_depth.reshape(rows, cols)
+    middle = median_filter(table, 3, mode="nearest")
+    padded = [np.pad(a, 2, mode="edge") for a in (table, middle, information.reshape(rows, cols))]
+    total, weight = np.zeros((rows, cols)), np.zeros((rows, cols))
+    for y in range(5):
+        for x in range(5):
+            value, around, share = (a[y : y + rows, x : x + cols] for a in padded)
+            unlike = (around - middle) ** 2 + (value - around) ** 2
+            near = 0.5 * ((x - 2) ** 2 + (y - 2) ** 2)
+            share = share * np.exp(-unlike / LIKE_LOG_DEPTH**2 - near)
+            total += share * value
+            weight += share
+    usable = weight > 0.0
+    return np.where(usable, total / np.where(usable, weight, 1.0), middle).ravel()
 
 
 def fill(values: Array, known: npt.NDArray[np.bool_], grid: Grid) -> Array:

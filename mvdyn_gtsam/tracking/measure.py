@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from factors.projection import reproject
 from mvdyn_gtsam.config import TrackingConfig
-from mvdyn_gtsam.frontend.dense_depth import upsample_depth
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, FlowPair, sample_pair
 from mvdyn_gtsam.frontend.guided_flow import guided_flow
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.tracking.depth import smoothed_log_depth
 from mvdyn_gtsam.tracking.images import ImageStore
 from mvdyn_gtsam.tracking.model import Guide, Keyframe, View
 
@@ -93,14 +93,14 @@ class EdgeMeasurer:
         i.flows[j.frame], j.flows[i.frame] = forward, backward
 
     def _dense_depth(self, keyframe: Keyframe) -> npt.NDArray[np.float32]:
-        """``(H, W)`` depth along the image's edges; kept while the keyframe's depth stays the same."""
+        """``(H, W)`` smooth depth between the grid points; kept while the keyframe's depth stays the same."""
         kept = self._dense.get(id(keyframe))
         if kept is not None and kept[0] is keyframe.log_depth:
             self._dense.move_to_end(id(keyframe))
             return kept[1]
         view = self._views[keyframe.camera]
-        image = self._images.get(keyframe.frame)
-        dense, _ = upsample_depth(image, view.grid, np.exp(keyframe.log_depth), np.ones(len(view.grid)))
+        smooth = smoothed_log_depth(keyframe.log_depth, keyframe.information, view.grid)
+        dense = np.exp(view.grid.expand(smooth, view.camera.width, view.camera.height))
         self._dense[id(keyframe)] = (keyframe.log_depth, dense)
         while len(self._dense) > 40:
             self._dense.popitem(last=False)

@@ -63,6 +63,8 @@ class Keyframe:
     """``(4, 4)``"""
     log_depth: Array
     """``(N,)`` latest solution on the grid."""
+    information: Array
+    """``(N,)`` inverse variance of ``log_depth``, poses held fixed."""
     prior_log_depth: Array
     """``(N,)``"""
     prior_sigma: Array
@@ -85,10 +87,11 @@ def measurement_of(
     config: TrackingConfig,
     steps: int = 4,
     thin: bool = False,
+    robust_px: float | None = None,
 ) -> StructurelessMeasurement:
     """The keyframe's flow to ``neighbours`` as the factor wants it.
 
-    ``thin`` takes every second grid point, as on a checkerboard.
+    ``thin`` takes every second grid point, as on a checkerboard; ``robust_px`` replaces the configured one.
     """
     view = views[keyframe.camera]
     flows = [keyframe.flows[frame] for frame in neighbours]
@@ -101,7 +104,7 @@ def measurement_of(
         intrinsics_j=np.stack([views[camera].intrinsics for camera, _ in neighbours]),
         target=np.stack([flow.target[points] for flow in flows]),
         weight=np.stack([flow.weight[points] for flow in flows]),
-        robust_px=config.robust_px,
+        robust_px=config.robust_px if robust_px is None else robust_px,
         noise_px=config.noise_px,
         steps=steps,
     )

@@ -35,13 +35,14 @@ def solve_all(
     config: TrackingConfig,
     priors: Priors,
     thin: bool = False,
+    robust_px: float | None = None,
 ) -> PolishSolve:
     """Levenberg-Marquardt over poses and depth scales of all ``keyframes``; they are updated in place.
 
     ``thin`` uses every second grid point: enough between two rounds of measuring.
     """
     frames = {keyframe.frame: keyframe for keyframe in keyframes}
-    graph, values = build_graph(keyframes, views, config, priors, thin)
+    graph, values = build_graph(keyframes, views, config, priors, thin, robust_px)
     parameters = gtsam.LevenbergMarquardtParams()
     # multifrontal Cholesky calls compressed factors indeterminate where sequential solves them
     parameters.setLinearSolverType("SEQUENTIAL_CHOLESKY")
@@ -78,6 +79,7 @@ def build_graph(
     config: TrackingConfig,
     priors: Priors,
     thin: bool = False,
+    robust_px: float | None = None,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """One structureless factor per keyframe over all it was measured against, and the priors."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -90,6 +92,8 @@ def build_graph(
         neighbours = [frame for frame in useful_neighbours(keyframe) if frame in members]
         if neighbours:
             snapshot = replace(keyframe, flows=dict(keyframe.flows))
-            measure = partial(measurement_of, snapshot, neighbours, views, config, thin=thin)
+            measure = partial(
+                measurement_of, snapshot, neighbours, views, config, thin=thin, robust_px=robust_px
+            )
             graph.add(keyframe_factor(keyframe.frame, neighbours, {}, measure))
     return graph, values

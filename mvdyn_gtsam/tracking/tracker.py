@@ -131,7 +131,7 @@ class Tracker:
 
     def _keyframe(self, camera: int, time: int, wTc: Array, log_depth: Array) -> Keyframe:
         sigma = np.full(len(log_depth), self._tracking.carried_sigma)
-        return Keyframe(camera, time, wTc, log_depth, log_depth, sigma)
+        return Keyframe(camera, time, wTc, log_depth, sigma**-2.0, log_depth, sigma)
 
     def _predictions(self, camera: int, time: int) -> list[Array]:
         """Poses to try, the most trusted first: the start's, and constant velocity corrected by tracking."""
@@ -172,7 +172,7 @@ class Tracker:
                 for source in sources
             ]
         )
-        fit = locate(seen, self._views[frame.camera].intrinsics, predictions, self._tracking.robust_px)
+        fit = locate(seen, self._views[frame.camera].intrinsics, predictions, self._tracking.window_robust_px)
         frame.wTc = fit.wTc
         return fit
 
@@ -303,7 +303,11 @@ class Tracker:
                 self._time("polish measure", began)
             began = perf_counter()
             last = polish_round == self._tracking.polish_rounds
-            solve_all(keyframes, self._views, self._tracking, self._priors, thin=not last)
+            # the first solve starts from the window's poses, with errors that a narrow loss would not see
+            robust_px = self._tracking.window_robust_px if polish_round == 0 else self._tracking.robust_px
+            solve_all(
+                keyframes, self._views, self._tracking, self._priors, thin=not last, robust_px=robust_px
+            )
             self._time("polish solve", began)
 
     def _remeasure(self, add: bool) -> None:
@@ -358,7 +362,7 @@ class Tracker:
                 wTc[camera, keyframe.time] = keyframe.wTc
                 covariances[camera, keyframe.time] = covariance[keyframe.frame]
                 rows.append(keyframe.log_depth)
-                weights.append(self._information(keyframe))
+                weights.append(keyframe.information)
             depths.append(np.stack(rows).astype(np.float32))
             informations.append(np.stack(weights).astype(np.float32))
             for frame in self._others[camera]:
@@ -412,13 +416,10 @@ class Tracker:
             key=lambda frame: (frame.time, frame.camera),
         )
         for frame in frames:
-            information = self._information(frame)
+            if frame.frame not in self._frames:
+                solve_depth(frame, self._frames, self._views, self._tracking)
             unit = self._units[self._group_of[frame.camera]]
-            yield FrameDepth(frame.camera, frame.time, frame.log_depth + np.log(unit), information)
-
-    def _information(self, frame: Keyframe) -> Array:
-        information = solve_depth(frame, self._frames, self._views, self._tracking)
-        return frame.prior_sigma**-2.0 if information is None else information
+            yield FrameDepth(frame.camera, frame.time, frame.log_depth + np.log(unit), frame.information)
 
     def _records(self) -> tuple[EdgeRecord, ...]:
         records: list[EdgeRecord] = []

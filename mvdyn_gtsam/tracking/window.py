@@ -108,7 +108,15 @@ class SlidingWindow:
         fixed = {frame: all_frames[frame].wTc for frame in neighbours if frame not in self._members}
         # a factor must not change: its flows and the start of its depths are those of now
         snapshot = replace(keyframe, flows=dict(keyframe.flows))
-        measure = partial(measurement_of, snapshot, neighbours, self._views, self._config, thin=True)
+        measure = partial(
+            measurement_of,
+            snapshot,
+            neighbours,
+            self._views,
+            self._config,
+            thin=True,
+            robust_px=self._config.window_robust_px,
+        )
         return keyframe_factor(keyframe.frame, neighbours, fixed, measure)
 
     def _settled_keys(self) -> gtsam.KeyList:
@@ -135,18 +143,19 @@ def solve_depth(
     views: tuple[View, ...],
     config: TrackingConfig,
     steps: int = 4,
-) -> np.ndarray | None:
-    """Solve the keyframe's log depths at the current poses of ``frames``; returns their information ``(N,)``.
+) -> None:
+    """Solve the keyframe's log depths at the current poses of ``frames``.
 
-    None, and nothing changed, where it has no useful neighbour among ``frames``.
+    Nothing changes where it has no useful neighbour among ``frames``.
     """
     neighbours = [frame for frame in useful_neighbours(keyframe) if frame in frames]
     if not neighbours:
-        return None
+        return
     measurement = measurement_of(keyframe, neighbours, views, config, steps)
     wTj = np.stack([frames[frame].wTc for frame in neighbours])
-    keyframe.log_depth, information = solve_log_depths(measurement, keyframe.wTc, wTj, keyframe.log_scale)
-    return information
+    keyframe.log_depth, keyframe.information = solve_log_depths(
+        measurement, keyframe.wTc, wTj, keyframe.log_scale
+    )
 
 
 def _make_isam() -> gtsam.ISAM2:
