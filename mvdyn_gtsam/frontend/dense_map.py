@@ -1,0 +1,202 @@
+"""Dense depth for a few frames of one camera's map, and how well the map explains what is seen.
+
+Structure from motion of one camera can be led astray by a large moving thing. Dense flow between the map's
+frames sees every surface: it gives the frames dense depth, and the share of flow that a rigid scene explains
+tells a good map from a bad one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from factors.structureless import (
+    StructurelessMeasurement,
+    edge_residuals,
+    solve_log_depths,
+)
+from mvdyn_gtsam.capture.model import Camera, Capture
+from mvdyn_gtsam.errors import ConfigError
+from mvdyn_gtsam.frontend.dense_depth import interpolate_sparse_depth
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowPair, GridFlow, sample_pair
+from mvdyn_gtsam.frontend.grid import Grid
+from mvdyn_gtsam.frontend.guided_flow import predicted_flow
+from mvdyn_gtsam.frontend.single_camera import CameraMap
+from mvdyn_gtsam.geometry import invert_pose, pixel_rays, transform_points
+
+Array = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class DenseMapConfig:
+    """Dense flow within one camera's map."""
+
+    frames: int = 6
+    """Frames of each camera that get dense depth. Source: choice, time."""
+    neighbours: int = 3
+    """Frames of the map before and after that flow is measured to. Source: choice, time."""
+    stride: int = 4
+    """Pixels between the grid points of the dense depth. Source: choice, time."""
+    far_motion: float = 0.06
+    """Predicted motion, in image widths, from which flow is seeded by the map. Source: DIS reaches 30 px."""
+    depth_sigma: float = 0.05
+    """Largest relative uncertainty of a depth that may testify about a placement. Source: choice."""
+    flow_sigma_px: float = 0.5
+    """Error of a flow vector of full weight, for that uncertainty. Source: experiments/flow_accuracy.py."""
+
+    def __post_init__(self) -> None:
+        if min(self.frames, self.neighbours, self.stride) < 1:
+            raise ConfigError("frontend.dense_map: frames, neighbours and stride must be at least 1")
+        if min(self.far_motion, self.depth_sigma, self.flow_sigma_px) <= 0.0:
+            raise ConfigError("frontend.dense_map: far_motion, depth_sigma, flow_sigma_px must be above 0")
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """A frame of a map with dense depth on a grid, ready to be warped."""
+
+    time: int
+    mTc: Array
+    """``(4, 4)`` in its camera's map."""
+    intrinsics: Array
+    grid: Grid
+    depth: Array
+    """``(N,)`` in the map's scale; NaN where not trustworthy."""
+    image: Float32
+    """``(H, W)`` grey, smoothed to the grid's resolution."""
+
+
+@dataclass(frozen=True)
+class DenseMap:
+    """A map with dense depth in some of its frames."""
+
+    sparse: CameraMap
+    views: tuple[DepthView, ...]
+    """Frames spread over the video."""
+    rigidity: float
+    """Share of the measured flow that a rigid scene explains to 1.5 px: what the map is worth."""
+
+
+Flows = dict[int, GridFlow]
+
+
+def densify_map(capture: Capture, camera_map: CameraMap, flow: DenseFlow, config: DenseMapConfig) -> DenseMap:
+    """Depth of a few frames, spread over the video, from flow to their neighbours in the map."""
+    camera = capture.cameras[camera_map.camera]
+    grid = Grid.covering(camera.width, camera.height, config.stride)
+    count = len(camera_map.times)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, config.frames)).round().astype(int))
+    views, explained, measured = [], 0.0, 0.0
+    for frame in chosen:
+        flows = _measure_flows(capture, camera_map, int(frame), grid, flow, config)
+        view, fitting, total = _depth_view(capture, camera_map, int(frame), grid, flows, config)
+        views.append(view)
+        explained += fitting
+        measured += total
+    return DenseMap(camera_map, tuple(views), explained / max(measured, 1e-12))
+
+
+def _measure_flows(
+    capture: Capture,
+    camera_map: CameraMap,
+    frame: int,
+    grid: Grid,
+    flow: DenseFlow,
+    config: DenseMapConfig,
+) -> Flows:
+    """Flow of one frame to the map's frames before and after it."""
+    camera = capture.cameras[camera_map.camera]
+    last = len(camera_map.times) - 1
+    span = range(max(0, frame - config.neighbours), min(last, frame + config.neighbours) + 1)
+
+    def view(index: int) -> tuple[npt.NDArray[np.uint8], Float32]:
+        grey = cv2.cvtColor(capture.read(camera_map.camera, int(camera_map.times[index])), cv2.COLOR_RGB2GRAY)
+        return np.asarray(grey, np.uint8), _sparse_depth(camera_map, index, camera)
+
+    views = {index: view(index) for index in span}
+    return {
+        other: sample_pair(_measure(camera_map, camera, frame, other, views, flow, config), grid, grid)[0]
+        for other in span
+        if other != frame
+    }
+
+
+def _measure(
+    camera_map: CameraMap,
+    camera: Camera,
+    first: int,
+    second: int,
+    recent: dict[int, tuple[npt.NDArray[np.uint8], Float32]],
+    flow: DenseFlow,
+    config: DenseMapConfig,
+) -> FlowPair:
+    (image_i, depth_i), (image_j, depth_j) = recent[first], recent[second]
+    intrinsics = camera.intrinsics
+    jTi = invert_pose(camera_map.mTc[second]) @ camera_map.mTc[first]
+    seed = predicted_flow(depth_i, intrinsics, intrinsics, jTi, image_j.shape)
+    motion = (
+        np.nanmedian(np.linalg.norm(seed[::8, ::8], axis=-1)) if np.isfinite(seed[::8, ::8]).any() else np.inf
+    )
+    if motion < config.far_motion * camera.width:
+        return flow.measure(image_i, image_j)
+    seed_backward = predicted_flow(depth_j, intrinsics, intrinsics, invert_pose(jTi), image_i.shape)
+    return flow.measure(image_i, image_j, seed, seed_backward)
+
+
+def _sparse_depth(camera_map: CameraMap, frame: int, camera: Camera) -> Float32:
+    rows = camera_map.point_of_keypoint[frame]
+    known = rows >= 0
+    depth = transform_points(invert_pose(camera_map.mTc[frame]), camera_map.points[rows[known]])[:, 2]
+    front = depth > 0.0
+    pixels = camera_map.features[frame].pixels[known][front]
+    if len(pixels) < 4:
+        return np.ones((camera.height, camera.width), np.float32)
+    return interpolate_sparse_depth(pixels, depth[front], camera.width, camera.height)
+
+
+def _depth_view(
+    capture: Capture,
+    camera_map: CameraMap,
+    frame: int,
+    grid: Grid,
+    flows: Flows,
+    config: DenseMapConfig,
+) -> tuple[DepthView, float, float]:
+    """Dense depth of one frame; also the weight of its flow that fits, and of all of it."""
+    camera = capture.cameras[camera_map.camera]
+    neighbours = list(flows)
+    start = np.log(np.maximum(grid.sample(_sparse_depth(camera_map, frame, camera)), 1e-6)).astype(np.float64)
+    measurement = StructurelessMeasurement(
+        rays=pixel_rays(grid.pixels, camera.intrinsics),
+        initial_log_depth=start,
+        prior_log_depth=start,
+        # A factor of e either way: keeps points without parallax from running off, says nothing else.
+        prior_sigma=np.ones(len(grid)),
+        intrinsics_j=np.tile([camera.fx, camera.fy, camera.cx, camera.cy], (len(neighbours), 1)),
+        target=np.stack([flows[other].target for other in neighbours]),
+        weight=np.stack([flows[other].weight for other in neighbours]),
+        steps=8,
+    )
+    mTi, mTj = camera_map.mTc[frame], camera_map.mTc[neighbours]
+    log_depth, information = solve_log_depths(measurement, mTi, mTj, 0.0)
+    norms = edge_residuals(measurement, mTi, mTj, 0.0).norms_px
+    weight = measurement.weight
+    fitting = np.where(np.nan_to_num(norms, nan=np.inf) < 1.5, weight, 0.0).sum(0)
+    measured = weight.sum(0)
+    sigma = config.flow_sigma_px / np.sqrt(np.maximum(information, 1e-12))
+    sure = (sigma < config.depth_sigma) & (fitting > 0.5 * measured) & (measured > 0.5)
+    time = int(camera_map.times[frame])
+    grey = cv2.cvtColor(capture.read(camera_map.camera, time), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    view = DepthView(
+        time=time,
+        mTc=mTi,
+        intrinsics=camera.intrinsics,
+        grid=grid,
+        depth=np.where(sure, np.exp(log_depth), np.nan),
+        image=cv2.GaussianBlur(grey, (0, 0), 0.35 * config.stride),
+    )
+    return view, float(fitting.sum()), float(measured.sum())

@@ -1,0 +1,56 @@
+"""Sparse keypoints for what dense flow cannot bridge: fast motion, and views of different cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True)
+class Features:
+    """Keypoints of one frame."""
+
+    pixels: npt.NDArray[np.float64]
+    """``(N, 2)`` px, pixel centres at integers."""
+    descriptors: npt.NDArray[np.float32]
+    """``(N, 128)``, unit length."""
+
+
+def extract_features(image: npt.NDArray[np.uint8], maximum: int, contrast: float) -> Features:
+    """RootSIFT features (Arandjelovic and Zisserman 2012) of an ``(H, W, 3)`` RGB image.
+
+    A contrast threshold below SIFT's usual 0.04 keeps points on nearly plain walls; false ones are
+    weeded out by geometry later.
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    detector = cv2.SIFT_create(maximum, contrastThreshold=contrast)
+    keypoints, descriptors = detector.detectAndCompute(grey, None)
+    if descriptors is None or len(keypoints) == 0:
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64)
+    # Several orientations of one point are kept by SIFT; the first (strongest) suffices here.
+    _, first = np.unique(pixels, axis=0, return_index=True)
+    first = np.sort(first)
+    descriptors = descriptors[first]
+    descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
+    return Features(pixels[first], descriptors.astype(np.float32))
+
+
+def match_features(first: Features, second: Features, ratio: float) -> npt.NDArray[np.int64]:
+    """Index pairs ``(M, 2)`` of mutual nearest neighbours that pass Lowe's ratio test."""
+    if len(first.pixels) < 2 or len(second.pixels) < 2:
+        return np.zeros((0, 2), np.int64)
+    similarity = first.descriptors @ second.descriptors.T
+    best = similarity.argmax(1)
+    rows = np.arange(len(best))
+    top = similarity[rows, best]
+    mutual = similarity.argmax(0)[best] == rows
+    similarity[rows, best] = -1.0
+    runner_up = similarity.max(1)
+    # Unit descriptors: squared distance = 2 - 2 * similarity.
+    distinct = (1.0 - top) < ratio**2 * (1.0 - runner_up)
+    chosen = np.flatnonzero(mutual & distinct)
+    return np.stack([chosen, best[chosen]], axis=1)

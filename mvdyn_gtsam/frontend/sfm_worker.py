@@ -1,0 +1,142 @@
+"""Structure from motion of one view set in a process of its own: ``python -m ...sfm_worker IN.npz OUT.npz``.
+
+A separate process keeps COLMAP's image libraries away from OpenCV's (two copies of zlib abort at the first
+PNG) and lets several cameras be solved side by side. One thread each, so that results repeat exactly.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2  # noqa: F401  must be loaded before pycolmap
+import numpy as np
+import pycolmap
+
+PIXEL_CENTRE = 0.5
+"""COLMAP puts the centre of the first pixel at 0.5."""
+
+
+def main(source: str, target: str) -> int:
+    problem = np.load(source)
+    pycolmap.logging.minloglevel = 3
+    pycolmap.set_random_seed(0)
+    with tempfile.TemporaryDirectory() as folder:
+        database = Path(folder) / "views.db"
+        _write_database(database, problem)
+        best = None
+        for mapping in (_global_mapping, _incremental_mapping):
+            for model in mapping(database, Path(folder) / mapping.__name__).values():
+                if best is None or model.num_reg_images() > best.num_reg_images():
+                    best = model
+            if best is not None and best.num_reg_images() >= 0.8 * len(problem["count"]):
+                break
+        np.savez(target, **_read_model(best, problem))
+    return 0
+
+
+def _write_database(path: Path, problem: Any) -> None:
+    fx, fy, cx, cy = problem["intrinsics"]
+    width, height = (int(x) for x in problem["size"])
+    parameters = [fx, fy, cx + PIXEL_CENTRE, cy + PIXEL_CENTRE]
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=parameters)
+    camera.has_prior_focal_length = True
+    splits = np.cumsum(problem["count"])[:-1]
+    keypoints = [pixels + PIXEL_CENTRE for pixels in np.split(problem["pixels"], splits)]
+    matches = np.split(problem["matches"].astype(np.uint32), np.cumsum(problem["match_count"])[:-1])
+    options = pycolmap.TwoViewGeometryOptions()
+    options.compute_relative_pose = True
+    options.ransac.random_seed = 0
+    options.ransac.max_error = float(problem["inlier_px"]) if "inlier_px" in problem else 1.0
+    with pycolmap.Database.open(path) as database:
+        camera.camera_id = database.write_camera(camera)
+        sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera.camera_id)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(sensor)
+        rig_id = database.write_rig(rig)
+        ids = []
+        for index, pixels in enumerate(keypoints):
+            image_id = database.write_image(pycolmap.Image(name=f"{index:06d}", camera_id=camera.camera_id))
+            frame = pycolmap.Frame()
+            frame.rig_id = rig_id
+            frame.add_data_id(pycolmap.data_t(sensor, image_id))
+            database.write_frame(frame)
+            database.write_keypoints(image_id, pixels.astype(np.float32))
+            ids.append(image_id)
+        for (first, second), pair in zip(problem["pairs"], matches, strict=True):
+            geometry = pycolmap.estimate_calibrated_two_view_geometry(
+                camera, keypoints[first], camera, keypoints[second], pair, options
+            )
+            database.write_matches(ids[first], ids[second], pair)
+            database.write_two_view_geometry(ids[first], ids[second], geometry)
+
+
+def _global_mapping(database: Path, output: Path) -> dict[int, Any]:
+    output.mkdir()
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = 0
+    options.multiple_models = False
+    mapper = options.mapper
+    mapper.bundle_adjustment.refine_focal_length = False
+    mapper.bundle_adjustment.refine_extra_params = False
+    mapper.bundle_adjustment.ceres.use_gpu = False
+    mapper.global_positioning.use_gpu = False
+    # Tighter than COLMAP's defaults (15 px, 0.01): intrinsics are known and moving things must fall out.
+    mapper.retriangulation.merge_max_reproj_error = 4.0
+    mapper.retriangulation.complete_max_reproj_error = 4.0
+    mapper.max_normalized_reproj_error = 0.005
+    try:
+        return dict(pycolmap.global_mapping(database, output, output, options))
+    except (RuntimeError, ValueError):  # pycolmap reports a failed stage this way; the other mapper is tried
+        return {}
+
+
+def _incremental_mapping(database: Path, output: Path) -> dict[int, Any]:
+    output.mkdir()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = 0
+    options.multiple_models = False
+    options.min_model_size = 3
+    options.extract_colors = False
+    options.ba_refine_focal_length = False
+    options.ba_refine_extra_params = False
+    mapper = options.mapper
+    mapper.abs_pose_refine_focal_length = False
+    mapper.abs_pose_refine_extra_params = False
+    # Hand-held video has little parallax and may move forwards; the defaults (16 degrees, 0.95) refuse it.
+    mapper.init_min_tri_angle = 4.0
+    mapper.init_max_forward_motion = 1.0
+    mapper.filter_min_tri_angle = 0.75
+    options.triangulation.min_angle = 0.75
+    return dict(pycolmap.incremental_mapping(database, output, output, options))
+
+
+def _read_model(model: Any, problem: Any) -> dict[str, Any]:
+    frames = len(problem["count"])
+    total = int(problem["count"].sum())
+    start = np.concatenate([[0], np.cumsum(problem["count"])])
+    cTw = np.full((frames, 4, 4), np.nan)
+    point_of_keypoint = np.full(total, -1, np.int64)
+    if model is None:
+        return {"cTw": cTw, "points": np.zeros((0, 3)), "point_of_keypoint": point_of_keypoint}
+    identifiers = sorted(model.points3D)
+    row = {identifier: index for index, identifier in enumerate(identifiers)}
+    points = np.array([model.points3D[identifier].xyz for identifier in identifiers]).reshape(-1, 3)
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        index = int(image.name)
+        cTw[index] = np.eye(4)
+        cTw[index, :3] = image.cam_from_world().matrix()
+        for keypoint, observation in enumerate(image.points2D):
+            if observation.has_point3D():
+                point_of_keypoint[start[index] + keypoint] = row[observation.point3D_id]
+    return {"cTw": cTw, "points": points, "point_of_keypoint": point_of_keypoint}
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1], sys.argv[2]))

@@ -1,0 +1,236 @@
+"""Each camera alone: a sparse map of what one camera saw, in a frame and scale of its own.
+
+One camera's own video has small steps and much overlap, so ordinary structure from motion is reliable
+there even where a joint one is not. What remains unknown is one similarity per camera.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.capture.model import Camera, Capture
+from mvdyn_gtsam.errors import TrackingError
+from mvdyn_gtsam.frontend.features import Features, match_features
+from mvdyn_gtsam.geometry import invert_pose, transform_points
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class CameraMap:
+    """Sparse map of one camera; m is the camera's own map frame, median depth 1.
+
+    A camera that shows no parallax (it stands still or only turns) has ``points`` empty; its ``mTc`` then
+    hold rotations only.
+    """
+
+    camera: int
+    times: npt.NDArray[np.int64]
+    """``(K,)`` frame numbers, increasing."""
+    mTc: npt.NDArray[np.float64]
+    """``(K, 4, 4)``"""
+    features: tuple[Features, ...]
+    """Per frame."""
+    point_of_keypoint: tuple[npt.NDArray[np.int64], ...]
+    """Per frame ``(N,)``: row in ``points``, -1 where the keypoint was not triangulated."""
+    points: npt.NDArray[np.float64]
+    """``(P, 3)`` in frame m."""
+
+    @property
+    def has_depth(self) -> bool:
+        return len(self.points) > 0
+
+
+def choose_frames(
+    capture: Capture, camera: int, step: float, maximum: int
+) -> tuple[npt.NDArray[np.int64], float]:
+    """Frame numbers spaced by image motion over the whole video, and that motion per frame as image widths.
+
+    A new frame is taken each time the median optical flow since the last one adds up to ``step`` image
+    widths; wider steps where that would give more than ``maximum`` frames. First and last are always taken.
+    """
+    flow_estimator = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    travelled = np.zeros(capture.frame_count)
+    previous: npt.NDArray[np.uint8] | None = None
+    for time in range(capture.frame_count):
+        frame = cv2.cvtColor(capture.read(camera, time), cv2.COLOR_RGB2GRAY)
+        small = cv2.resize(
+            frame, (256, round(256 * frame.shape[0] / frame.shape[1])), interpolation=cv2.INTER_AREA
+        )
+        if previous is not None:
+            flow = flow_estimator.calc(previous, small, None)[::4, ::4].reshape(-1, 2)
+            moved = np.median(np.linalg.norm(flow, axis=1)) / small.shape[1]
+            travelled[time] = travelled[time - 1] + moved
+        previous = np.asarray(small, np.uint8)
+    step = max(step, travelled[-1] / max(maximum - 1, 1))
+    chosen = [0]
+    for time in range(1, capture.frame_count):
+        if travelled[time] - travelled[chosen[-1]] >= step:
+            chosen.append(time)
+    if chosen[-1] != capture.frame_count - 1:
+        chosen.append(capture.frame_count - 1)
+    return np.array(chosen), float(travelled[-1])
+
+
+def build_camera_maps(
+    cameras: Sequence[Camera],
+    times: Sequence[npt.NDArray[np.int64]],
+    features: Sequence[Sequence[Features]],
+    *,
+    neighbours: int,
+    ratio: float,
+    minimum_angle_deg: float,
+) -> list[CameraMap]:
+    """Structure from motion of each camera alone, side by side.
+
+    ``neighbours`` frames ahead are matched. A camera whose median triangulation angle stays below
+    ``minimum_angle_deg`` is returned without points.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        jobs: list[subprocess.Popen[bytes] | None] = []
+        running: list[subprocess.Popen[bytes]] = []
+        for index, camera in enumerate(cameras):
+            pairs = _match_neighbours(features[index], neighbours, ratio)
+            if len(times[index]) < 3 or not pairs:
+                jobs.append(None)
+                continue
+            problem = Path(folder) / f"{index}.npz"
+            _write_problem(problem, camera, features[index], pairs)
+            command = [sys.executable, "-m", "mvdyn_gtsam.frontend.sfm_worker", str(problem)]
+            if len(running) >= (os.cpu_count() or 1):
+                running.pop(0).wait()
+            job = subprocess.Popen(
+                [*command, f"{folder}/{index}.out.npz"],
+                stdout=subprocess.DEVNULL,
+                stderr=(Path(folder) / f"{index}.log").open("wb"),
+            )
+            jobs.append(job)
+            running.append(job)
+        maps = []
+        for index, job in enumerate(jobs):
+            camera_features = tuple(features[index])
+            if job is None:
+                maps.append(_map_without_depth(index, times[index], camera_features))
+                continue
+            if job.wait() != 0:
+                log = (Path(folder) / f"{index}.log").read_text(errors="replace").strip().splitlines()
+                reason = log[-1] if log else f"exit code {job.returncode}"
+                raise TrackingError(f"structure from motion of {cameras[index].name} failed: {reason}")
+            with np.load(f"{folder}/{index}.out.npz") as solution:
+                built = _read_map(index, times[index], camera_features, dict(solution))
+            angle = _median_triangulation_angle_deg(built)
+            logger.info(
+                "%s alone: %d of %d frames, %d points, %.1f degrees of parallax",
+                cameras[index].name,
+                len(built.times),
+                len(times[index]),
+                len(built.points),
+                angle,
+            )
+            if angle < minimum_angle_deg:
+                built = _map_without_depth(index, times[index], camera_features)
+            maps.append(built)
+    return maps
+
+
+def _match_neighbours(
+    features: Sequence[Features], neighbours: int, ratio: float
+) -> dict[tuple[int, int], npt.NDArray[np.int64]]:
+    pairs = {}
+    for first in range(len(features)):
+        for second in range(first + 1, min(first + neighbours + 1, len(features))):
+            matches = match_features(features[first], features[second], ratio)
+            if len(matches) >= 15:  # COLMAP's min_num_matches
+                pairs[first, second] = matches
+    return pairs
+
+
+def _write_problem(
+    path: Path,
+    camera: Camera,
+    features: Sequence[Features],
+    pairs: dict[tuple[int, int], npt.NDArray[np.int64]],
+) -> None:
+    np.savez(
+        path,
+        intrinsics=[camera.fx, camera.fy, camera.cx, camera.cy],
+        size=[camera.width, camera.height],
+        count=[len(frame.pixels) for frame in features],
+        pixels=np.concatenate([frame.pixels for frame in features]),
+        pairs=np.array(list(pairs), np.int64),
+        match_count=[len(matches) for matches in pairs.values()],
+        matches=np.concatenate(list(pairs.values())),
+    )
+
+
+def _read_map(
+    camera: int,
+    times: npt.NDArray[np.int64],
+    features: tuple[Features, ...],
+    solution: dict[str, npt.NDArray[np.float64]],
+) -> CameraMap:
+    registered = np.flatnonzero(np.isfinite(solution["cTw"][:, 0, 0]))
+    points = solution["points"]
+    splits = np.cumsum([len(frame.pixels) for frame in features])[:-1]
+    point_of_keypoint = np.split(solution["point_of_keypoint"].astype(np.int64), splits)
+    if len(registered) < 3 or len(points) < 10:
+        return _map_without_depth(camera, times, features)
+    mTc = invert_pose(solution["cTw"][registered])
+    depth = np.concatenate(
+        [
+            transform_points(invert_pose(mTc[row]), points[rows[rows >= 0]])[:, 2]
+            for row, rows in enumerate(point_of_keypoint[frame] for frame in registered)
+        ]
+    )
+    unit = float(np.median(depth))
+    mTc[:, :3, 3] /= unit
+    return CameraMap(
+        camera=camera,
+        times=times[registered],
+        mTc=mTc,
+        features=tuple(features[frame] for frame in registered),
+        point_of_keypoint=tuple(point_of_keypoint[frame] for frame in registered),
+        points=points / unit,
+    )
+
+
+def _map_without_depth(
+    camera: int, times: npt.NDArray[np.int64], features: tuple[Features, ...]
+) -> CameraMap:
+    return CameraMap(
+        camera=camera,
+        times=times[:1],
+        mTc=np.eye(4)[None],
+        features=features[:1],
+        point_of_keypoint=(np.full(len(features[0].pixels), -1, np.int64),),
+        points=np.zeros((0, 3)),
+    )
+
+
+def _median_triangulation_angle_deg(camera_map: CameraMap) -> float:
+    """Median over points of the largest angle between two rays that saw them."""
+    if not camera_map.has_depth:
+        return 0.0
+    centres = camera_map.mTc[:, :3, 3]
+    first = np.full(len(camera_map.points), -1)
+    angle = np.zeros(len(camera_map.points))
+    for frame, rows in enumerate(camera_map.point_of_keypoint):
+        seen = rows[rows >= 0]
+        new = seen[first[seen] < 0]
+        first[new] = frame
+        before = camera_map.points[seen] - centres[first[seen]]
+        now = camera_map.points[seen] - centres[frame]
+        cosine = (before * now).sum(1) / (np.linalg.norm(before, axis=1) * np.linalg.norm(now, axis=1))
+        angle[seen] = np.maximum(angle[seen], np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return float(np.median(angle[first >= 0]))

@@ -1,0 +1,147 @@
+"""Whether two cameras' maps can stand where a hypothesis puts them: dense warping over many instants.
+
+Dense depth of a few frames of each camera is carried into the other camera's frames. Where a hypothesis is
+true, surfaces meet at the same depth and look the same. Where it is false, one camera's surfaces float in
+space the other one looks straight through, or surfaces meet that look different; a repeated texture cannot
+hide that, because everything around it disagrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.errors import ConfigError
+from mvdyn_gtsam.frontend.dense_map import DepthView
+from mvdyn_gtsam.geometry import Similarity, invert_pose, pixel_rays, transform_points
+
+Array = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class VerificationConfig:
+    """When a placement is believed."""
+
+    agree: float = 0.07
+    """Relative depth difference up to which two surfaces are one. Source: experiments/wide_baseline.py."""
+    conflict: float = 0.15
+    """How much nearer a surface must be to float in seen-through space. Source: as above."""
+    texture: float = 3.0
+    """Grey-level deviation in a patch below which looks prove nothing. Source: image noise, 2 levels."""
+    same_look: float = 0.6
+    """Normalised cross-correlation from which two patches look the same. Source: as above."""
+    other_look: float = 0.1
+    """And below which they look different. Source: as above."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.agree <= self.conflict:
+            raise ConfigError("frontend.verification: agree must be above 0 and at most conflict")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What dense warping says of a placement; areas in shares of one image, summed over frame pairs."""
+
+    agreement: float
+    """Textured area that meets the other camera's surface at its depth and looks the same."""
+    contradiction: float
+    """Area that floats in front of what the other camera sees, or meets it and looks different."""
+    frame_pairs: int
+    """Pairs of frames with any overlap."""
+
+    @property
+    def trust(self) -> float:
+        """Share of the testimony that is in favour."""
+        return self.agreement / max(self.agreement + self.contradiction, 1e-12)
+
+
+def verify_placement(
+    views_a: Sequence[DepthView], views_b: Sequence[DepthView], aSb: Similarity, config: VerificationConfig
+) -> Verdict:
+    """Warp every view of either camera into every view of the other."""
+    agreement = contradiction = 0.0
+    overlapping = 0
+    bSa = aSb.inverse()
+    for a in views_a:
+        for b in views_b:
+            forward = _testimony(a, b, bSa, config)
+            backward = _testimony(b, a, aSb, config)
+            overlapping += forward[2] or backward[2]
+            agreement += forward[0] + backward[0]
+            contradiction += forward[1] + backward[1]
+    return Verdict(agreement, contradiction, overlapping)
+
+
+def _testimony(
+    source: DepthView, target: DepthView, targetSsource: Similarity, config: VerificationConfig
+) -> tuple[float, float, bool]:
+    """Agreeing and contradicting shares of the source image, and whether the views overlap at all."""
+    known = np.isfinite(source.depth)
+    rays = pixel_rays(source.grid.pixels, source.intrinsics)
+    depth = np.where(known, source.depth, 1.0)
+    points = transform_points(source.mTc, rays * depth[:, None])
+    seen = transform_points(invert_pose(target.mTc), targetSsource.transform_points(points))
+    z = np.where(seen[:, 2] > 1e-6, seen[:, 2], np.nan)
+    x = target.intrinsics[0, 0] * seen[:, 0] / z + target.intrinsics[0, 2]
+    y = target.intrinsics[1, 1] * seen[:, 1] / z + target.intrinsics[1, 2]
+    height, width = target.image.shape
+    with np.errstate(invalid="ignore"):
+        inside = known & (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+    if not inside.any():
+        return 0.0, 0.0, False
+    surface = _depth_at(target, x, y, inside)
+    offset = np.log(np.where(inside, z, 1.0)) - np.log(surface)
+    with np.errstate(invalid="ignore"):
+        meets = np.abs(offset) < config.agree
+        floats = offset < -config.conflict
+    look, textured = _look(source, target, x, y, inside, config)
+    same = meets & textured & (look > config.same_look)
+    different = meets & textured & (look < config.other_look)
+    total = len(source.depth)
+    return float(same.sum() / total), float((different | floats).sum() / total), True
+
+
+def _depth_at(view: DepthView, x: Array, y: Array, inside: npt.NDArray[np.bool_]) -> Array:
+    """The view's own depth at the nearest grid point; NaN where unknown."""
+    rows, cols = view.grid.shape
+    origin = view.grid.pixels[0]
+    column = np.where(inside, np.rint((x - origin[0]) / view.grid.stride), 0).astype(int)
+    row = np.where(inside, np.rint((y - origin[1]) / view.grid.stride), 0).astype(int)
+    nearest = np.clip(row, 0, rows - 1) * cols + np.clip(column, 0, cols - 1)
+    return np.where(inside, view.depth[nearest], np.nan)
+
+
+def _look(
+    source: DepthView,
+    target: DepthView,
+    x: Array,
+    y: Array,
+    inside: npt.NDArray[np.bool_],
+    config: VerificationConfig,
+) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Normalised cross-correlation on the source grid (5 x 5 grid points) and where there is texture."""
+    shape = source.grid.shape
+    map_x = np.where(inside, x, -1).astype(np.float32).reshape(shape)
+    map_y = np.where(inside, y, -1).astype(np.float32).reshape(shape)
+    warped = cv2.remap(target.image, map_x, map_y, cv2.INTER_LINEAR)
+    own = source.grid.sample(source.image).reshape(shape)
+    mask = inside.reshape(shape).astype(np.float32)
+
+    def mean(field: Float32) -> Float32:
+        return cv2.boxFilter(field, -1, (5, 5), normalize=False)
+
+    count = np.maximum(mean(mask), 1.0)
+    own, warped = own * mask, warped * mask
+    mean_own, mean_warped = mean(own) / count, mean(warped) / count
+    variance_own = np.maximum(mean(own * own) / count - mean_own**2, 0.0)
+    variance_warped = np.maximum(mean(warped * warped) / count - mean_warped**2, 0.0)
+    covariance = mean(own * warped) / count - mean_own * mean_warped
+    noise = 1.0
+    look = covariance / np.sqrt((variance_own + noise) * (variance_warped + noise))
+    enough = (count >= 13) & (variance_own > config.texture**2) & (mask > 0)
+    return look.ravel().astype(np.float64), enough.ravel()

@@ -1,0 +1,235 @@
+"""The wide-baseline start: every camera's place in one world before tracking begins.
+
+The classical default needs no network. Each camera's own video gives a map of its own (easy); what remains
+is one similarity per camera, over-determined by matches pooled over the whole video. Hypotheses for it are
+believed only after dense warping over many instants, cameras that nothing connects stay apart, and a joint
+bundle adjustment has the last word.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.capture.model import Capture
+from mvdyn_gtsam.errors import ConfigError, TrackingError
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow
+from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map
+from mvdyn_gtsam.frontend.features import extract_features
+from mvdyn_gtsam.frontend.joint_adjustment import adjust_maps
+from mvdyn_gtsam.frontend.placement import (
+    PlacementConfig,
+    PointMatches,
+    agreeing_pairs,
+    match_maps,
+    propose_placements,
+)
+from mvdyn_gtsam.frontend.single_camera import CameraMap, build_camera_maps, choose_frames
+from mvdyn_gtsam.frontend.start import Start, StartFrame
+from mvdyn_gtsam.frontend.verification import Verdict, VerificationConfig, verify_placement
+from mvdyn_gtsam.geometry import Similarity
+from mvdyn_gtsam.progress import NullProgress, Progress
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class WideBaselineConfig:
+    """The start without weights."""
+
+    frame_step: float = 0.03
+    """Image motion between a map's frames, in image widths. Source: experiments/wide_baseline.py."""
+    maximum_frames: int = 40
+    """Frames per camera at most; the step widens for longer videos. Source: choice, time."""
+    features: int = 3000
+    """Keypoints per frame. Source: experiments/wide_baseline.py."""
+    contrast: float = 0.01
+    """SIFT contrast threshold; below the usual 0.04 for plain walls. Source: as above."""
+    neighbours: int = 4
+    """Frames ahead matched within a camera. Source: choice, time."""
+    ratio: float = 0.8
+    """Lowe's ratio within a camera. Source: Lowe 2004."""
+    minimum_parallax_deg: float = 1.0
+    """Median triangulation angle below which a camera counts as standing still. Source: choice."""
+    minimum_trust: float = 0.5
+    """Share of favourable testimony a placement needs. Source: experiments/wide_baseline.py."""
+    minimum_agreement: float = 0.02
+    """Agreeing share of the image per frame pair it needs. Source: as above."""
+    points_per_camera: int = 800
+    """Points of one camera alone that enter the joint adjustment. Source: choice, time."""
+    placement: PlacementConfig = field(default_factory=PlacementConfig)
+    dense_map: DenseMapConfig = field(default_factory=DenseMapConfig)
+    verification: VerificationConfig = field(default_factory=VerificationConfig)
+
+    def __post_init__(self) -> None:
+        if min(self.maximum_frames, self.neighbours) < 2 or self.features < 100:
+            raise ConfigError("frontend.wide_baseline: at least 2 frames, 2 neighbours and 100 features")
+        if not 0.0 < self.frame_step < 0.5:
+            raise ConfigError(f"frontend.wide_baseline.frame_step is {self.frame_step}; between 0 and 0.5")
+
+
+class WideBaselineInitializer(Protocol):
+    """Anything that places the cameras: classical, or a feed-forward network such as VGGT behind ONNX."""
+
+    def __call__(self, capture: Capture, progress: Progress) -> Start:
+        """Poses and sparse depths of some frames of every camera. Raises TrackingError when nothing can
+        be placed at all."""
+        ...
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A verified link between two cameras' maps."""
+
+    first: int
+    second: int
+    aSb: Similarity
+    verdict: Verdict
+
+
+class ClassicalInitializer:
+    """The default start: structure from motion per camera, pooled matches, dense verification."""
+
+    def __init__(self, flow: DenseFlow, config: WideBaselineConfig | None = None) -> None:
+        self.flow = flow
+        self.config = config if config is not None else WideBaselineConfig()
+
+    def __call__(self, capture: Capture, progress: Progress | None = None) -> Start:
+        """See ``WideBaselineInitializer``."""
+        progress = progress if progress is not None else NullProgress()
+        config = self.config
+        maps = self._maps(capture, progress)
+        dense = {
+            camera_map.camera: densify_map(capture, camera_map, self.flow, config.dense_map)
+            for camera_map in maps
+            if camera_map.has_depth
+        }
+        if not dense:
+            names = ", ".join(camera.name for camera in capture.cameras)
+            raise TrackingError(
+                f"{capture.name}: none of {names} moves enough to see depth; let at least one camera move"
+            )
+        links, matches = self._links(capture, dense, progress)
+        groups = connect(list(dense), links)
+        frames: dict[int, tuple[StartFrame, ...]] = {}
+        for group in groups:
+            same_point = [
+                (a, b, self._same_points(capture, matches[a, b], a, b, group))
+                for a, b in matches
+                if a in group and b in group
+            ]
+            frames |= adjust_maps(capture.cameras, maps, group, same_point, config.points_per_camera)
+        for camera_map in maps:
+            if camera_map.camera not in dense:
+                groups.append({camera_map.camera: Similarity.identity()})
+                frames[camera_map.camera] = (_lone_frame(camera_map),)
+        return Start(
+            groups=tuple(tuple(sorted(group)) for group in groups),
+            frames=tuple(frames[camera] for camera in range(len(capture.cameras))),
+        )
+
+    def _same_points(
+        self, capture: Capture, matches: PointMatches, a: int, b: int, group: Mapping[int, Similarity]
+    ) -> npt.NDArray[np.int64]:
+        aSb = group[a].inverse().compose(group[b])
+        intrinsics_a, intrinsics_b = capture.cameras[a].intrinsics, capture.cameras[b].intrinsics
+        return agreeing_pairs(matches, aSb, intrinsics_a, intrinsics_b, self.config.placement)
+
+    def _maps(self, capture: Capture, progress: Progress) -> list[CameraMap]:
+        config = self.config
+        times, features = [], []
+        for camera in range(len(capture.cameras)):
+            chosen, _ = choose_frames(capture, camera, config.frame_step, config.maximum_frames)
+            times.append(chosen)
+            features.append(
+                [
+                    extract_features(capture.read(camera, int(t)), config.features, config.contrast)
+                    for t in chosen
+                ]
+            )
+            progress.update("start", camera + 1, 2 * len(capture.cameras), "features")
+        return build_camera_maps(
+            capture.cameras,
+            times,
+            features,
+            neighbours=config.neighbours,
+            ratio=config.ratio,
+            minimum_angle_deg=config.minimum_parallax_deg,
+        )
+
+    def _links(
+        self, capture: Capture, dense: Mapping[int, DenseMap], progress: Progress
+    ) -> tuple[list[Placement], dict[tuple[int, int], PointMatches]]:
+        """The best verified placement of every pair of cameras that has one."""
+        pairs = [(a, b) for a in dense for b in dense if a < b]
+        links, matches = [], {}
+        for number, (a, b) in enumerate(pairs):
+            progress.update("start", len(pairs) + number, 2 * len(pairs), "placing cameras")
+            matches[a, b] = match_maps(dense[a].sparse, dense[b].sparse, self.config.placement)
+            link = self._place(capture, dense[a], dense[b], matches[a, b])
+            names = f"{capture.cameras[a].name} - {capture.cameras[b].name}"
+            if link is None:
+                logger.info("%s: no placement stands up to dense warping", names)
+                continue
+            logger.info("%s: placed, %.0f %% of the testimony in favour", names, 100.0 * link.verdict.trust)
+            links.append(link)
+        return links, matches
+
+    def _place(
+        self, capture: Capture, first: DenseMap, second: DenseMap, matches: PointMatches
+    ) -> Placement | None:
+        config = self.config
+        a, b = first.sparse.camera, second.sparse.camera
+        best: Placement | None = None
+        for hypothesis in propose_placements(
+            matches, capture.cameras[a].intrinsics, capture.cameras[b].intrinsics, config.placement
+        ):
+            verdict = verify_placement(first.views, second.views, hypothesis.aSb, config.verification)
+            if verdict.trust < config.minimum_trust:
+                continue
+            if verdict.agreement < config.minimum_agreement * verdict.frame_pairs:
+                continue
+            if best is None or strength(verdict) > strength(best.verdict):
+                best = Placement(a, b, hypothesis.aSb, verdict)
+        return best
+
+
+def _lone_frame(camera_map: CameraMap) -> StartFrame:
+    return StartFrame(int(camera_map.times[0]), np.eye(4), np.zeros((0, 2)), np.zeros(0))
+
+
+def strength(verdict: Verdict) -> float:
+    """How much is agreed on, discounted by how much is disputed."""
+    return verdict.agreement * verdict.trust
+
+
+def connect(cameras: list[int], links: list[Placement]) -> list[dict[int, Similarity]]:
+    """Groups of connected cameras, each camera's map placed in its group's world (``wSm``).
+
+    The strongest links are taken first (a maximum spanning forest); the world of a group is the map of its
+    lowest-numbered camera.
+    """
+    group_of = {camera: {camera: Similarity.identity()} for camera in cameras}
+    for link in sorted(links, key=lambda link: -strength(link.verdict)):
+        first, second = group_of[link.first], group_of[link.second]
+        if first is second:
+            continue
+        # first world <- map a <- map b <- second world
+        bridge = first[link.first].compose(link.aSb).compose(second[link.second].inverse())
+        for camera, similarity in second.items():
+            first[camera] = bridge.compose(similarity)
+            group_of[camera] = first
+    groups: list[dict[int, Similarity]] = []
+    for camera in cameras:
+        group = group_of[camera]
+        if not any(group is known for known in groups):
+            groups.append(group)
+    return [
+        {camera: group[min(group)].inverse().compose(group[camera]) for camera in sorted(group)}
+        for group in groups
+    ]
