@@ -13,6 +13,8 @@ from typing import Any
 
 from mvdyn_gtsam.config_tree import ConfigKey, build, describe_tree, parse_override, read_file, to_plain
 from mvdyn_gtsam.errors import ConfigError
+from mvdyn_gtsam.frontend.dense_flow import FlowConfig
+from mvdyn_gtsam.frontend.wide_baseline import WideBaselineConfig
 
 
 def require(condition: bool, message: str) -> None:
@@ -33,14 +35,8 @@ class CaptureConfig:
 class FrontendConfig:
     """Measuring: flow, depth priors, the wide-baseline start."""
 
-    initial_frames: int = 8
-    """Frames per camera used by the wide-baseline start (N_init). Source: paper supplement, parameters."""
-
-    def __post_init__(self) -> None:
-        require(
-            self.initial_frames >= 2,
-            f"frontend.initial_frames is {self.initial_frames}; it must be at least 2",
-        )
+    flow: FlowConfig = field(default_factory=FlowConfig)
+    wide_baseline: WideBaselineConfig = field(default_factory=WideBaselineConfig)
 
 
 @dataclass(frozen=True)
@@ -108,14 +104,18 @@ class TrackingConfig:
     noise_px: float = 0.2
     """Standard deviation of flow of weight one, px. Source: measured against the true flow of the rendered
     scenes (median 0.11 to 0.22 px); too large a value lets the depth prior bias the poses."""
+    noise_per_residual: float = 1.5
+    """Noise of a keyframe's flow over the median of its residuals. Source: experiments/tracking_sweep.py."""
+    max_noise_px: float = 1.0
+    """Largest noise a keyframe's flow is taken to have, px. Source: DESIGN 5 (Cauchy, ~1 px)."""
     carried_sigma: float = 0.5
     """Standard deviation of the prior on log depth where the depth was carried over. Source:
     experiments/tracking_sweep.py."""
     scale_sigma: float = 0.3
     """Standard deviation of a keyframe's log depth scale. Source: choice."""
-    start_rotation_deg: float = 0.5
+    start_rotation_deg: float = 0.25
     """Standard deviation of the start's rotations. Source: the start's own goal."""
-    start_translation: float = 0.03
+    start_translation: float = 0.01
     """Standard deviation of the start's positions, in median depths. Source: the start's own goal."""
     step_iterations: int = 2
     """iSAM2 updates per time step. Source: experiments/tracking_sweep.py."""

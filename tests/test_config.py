@@ -40,7 +40,7 @@ def test_defaults_round_trip() -> None:
 
 def test_every_key_has_a_source() -> None:
     keys = describe()
-    assert {"tracking.window", "graph.temporal_offsets", "frontend.initial_frames"} <= {k.key for k in keys}
+    assert {"tracking.window", "graph.temporal_offsets", "frontend.flow.patch_size"} <= {k.key for k in keys}
     missing = [key.key for key in keys if "Source:" not in key.doc]
     assert not missing
 

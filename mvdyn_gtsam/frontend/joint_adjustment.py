@@ -3,26 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from factors.keys import X
 from factors.priors import pose_prior
 from mvdyn_gtsam.capture.model import Camera
+from mvdyn_gtsam.errors import ConfigError
+from mvdyn_gtsam.frontend.features import Features
 from mvdyn_gtsam.frontend.single_camera import CameraMap
 from mvdyn_gtsam.frontend.start import StartFrame
-from mvdyn_gtsam.geometry import Similarity, invert_pose, transform_points
+from mvdyn_gtsam.geometry import Similarity, invert_pose, project, transform_points
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 ROBUST_PX = 1.0
 """Cauchy scale of reprojection errors; SIFT is good to about half a pixel."""
+MISFIT_PX = 4.0
+"""Reprojection error beyond which a sighting is dropped; COLMAP's filter_max_reproj_error."""
+
+
+@dataclass(frozen=True)
+class AdjustmentConfig:
+    """Joint bundle adjustment of the start."""
+
+    points_per_camera: int = 800
+    """Points of one camera alone that enter. Source: choice, time."""
+    search_px: tuple[float, ...] = (12.0, 5.0)
+    """Radius of each round of looking for points in frames that should see them. Source: choice."""
+    similarity: float = 0.85
+    """Cosine of two descriptors from which they may be one point. Source: experiments/wide_baseline.py."""
+
+    def __post_init__(self) -> None:
+        if self.points_per_camera < 50 or any(radius <= 0.0 for radius in self.search_px):
+            raise ConfigError("frontend.wide_baseline.adjustment: points_per_camera >= 50, search_px above 0")
 
 
 @dataclass(frozen=True)
@@ -46,22 +67,109 @@ def adjust_maps(
     maps: Sequence[CameraMap],
     wSm: Mapping[int, Similarity],
     same_point: Sequence[tuple[int, int, Index]],
-    points_per_camera: int,
+    config: AdjustmentConfig,
 ) -> dict[int, tuple[StartFrame, ...]]:
     """Frames of every placed camera in the common world, sparse depths included.
 
-    ``same_point`` holds ``(camera a, camera b, (M, 2) rows of map points that are one)``. Points seen by
-    several cameras are all used; of the rest, the longest observed ``points_per_camera``.
+    ``same_point`` holds ``(camera a, camera b, (M, 2) rows of map points that are one)``. After a first
+    solution every point is looked for in every other frame, near where it should be: that closes loops
+    between cameras and within one, and the second solution has far more to go by.
     """
-    observations = _gather(maps, wSm, same_point, points_per_camera)
-    wTc, points = _optimise(cameras, maps, wSm, observations)
+    observations = _gather(maps, wSm, same_point, config.points_per_camera)
+    wTc = {
+        (camera, frame): pose
+        for camera, similarity in wSm.items()
+        for frame, pose in enumerate(similarity.transform_poses(maps[camera].mTc))
+    }
+    wTc, observations = _optimise(cameras, wTc, observations)
+    for radius in config.search_px:
+        found = _search(cameras, maps, wTc, observations, radius, config.similarity)
+        wTc, observations = _optimise(cameras, wTc, found)
     return {
         camera: tuple(
-            _start_frame(camera, frame, maps[camera], wTc[camera, frame], observations, points)
+            _start_frame(camera, frame, maps[camera], wTc[camera, frame], observations)
             for frame in range(len(maps[camera].times))
         )
         for camera in wSm
     }
+
+
+def _search(
+    cameras: Sequence[Camera],
+    maps: Sequence[CameraMap],
+    wTc: Mapping[tuple[int, int], Array],
+    observations: Observations,
+    radius: float,
+    similarity: float,
+) -> Observations:
+    """Also the keypoints that look like a landmark and lie within ``radius`` of its projection."""
+    descriptor = _descriptors(maps, observations)
+    added = [
+        np.column_stack([observations.landmark, observations.camera, observations.frame, observations.pixel])
+    ]
+    for (camera, frame), pose in wTc.items():
+        here = (observations.camera == camera) & (observations.frame == frame)
+        unseen = np.ones(len(observations.points), bool)
+        unseen[observations.landmark[here]] = False
+        features = maps[camera].features[frame]
+        # Keypoints that already are a landmark's stay its own.
+        free = np.ones(len(features.pixels), bool)
+        free[cKDTree(features.pixels).query(observations.pixel[here])[1]] = False
+        candidates, pixels = _visible(cameras[camera], pose, observations.points, np.flatnonzero(unseen))
+        landmark, keypoint = _look_near(
+            descriptor[candidates], pixels, features, np.flatnonzero(free), radius, similarity
+        )
+        label = np.broadcast_to([camera, frame], (len(landmark), 2))
+        added.append(np.column_stack([candidates[landmark], label, features.pixels[keypoint]]))
+    table = np.concatenate(added)
+    columns = table[:, :3].astype(np.int64)
+    return Observations(columns[:, 0], columns[:, 1], columns[:, 2], table[:, 3:5], observations.points)
+
+
+def _descriptors(maps: Sequence[CameraMap], observations: Observations) -> npt.NDArray[np.float32]:
+    """``(P, 128)`` mean descriptor of each landmark's sightings, unit length."""
+    total = np.zeros((len(observations.points), 128), np.float32)
+    for camera, frame in np.unique(np.column_stack([observations.camera, observations.frame]), axis=0):
+        here = (observations.camera == camera) & (observations.frame == frame)
+        features = maps[camera].features[frame]
+        keypoint = cKDTree(features.pixels).query(observations.pixel[here])[1]
+        np.add.at(total, observations.landmark[here], features.descriptors[keypoint])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
+
+
+def _visible(camera: Camera, wTc: Array, points: Array, rows: Index) -> tuple[Index, Array]:
+    """Those of ``rows`` whose points fall inside the image, and where."""
+    pixels, depth = project(transform_points(invert_pose(wTc), points[rows]), camera.intrinsics)
+    with np.errstate(invalid="ignore"):
+        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
+    return rows[inside], pixels[inside]
+
+
+def _look_near(
+    descriptor: npt.NDArray[np.float32],
+    pixels: Array,
+    features: Features,
+    free: Index,
+    radius: float,
+    similarity: float,
+) -> tuple[Index, Index]:
+    """Landmark rows and keypoints that are each other's best look within ``radius``."""
+    empty = np.zeros(0, np.int64)
+    if len(free) == 0 or len(pixels) == 0:
+        return empty, empty
+    near = cKDTree(pixels).sparse_distance_matrix(
+        cKDTree(features.pixels[free]), radius, output_type="coo_matrix"
+    )
+    row, column = near.row.astype(np.int64), near.col.astype(np.int64)
+    look = (descriptor[row] * features.descriptors[free[column]]).sum(1)
+    good = look > similarity
+    row, column, look = row[good], column[good], look[good]
+    order = np.argsort(-look, kind="stable")
+    row, column = row[order], column[order]
+    best_of_row = np.unique(row, return_index=True)[1]
+    best_of_column = np.unique(column, return_index=True)[1]
+    mutual = np.intersect1d(best_of_row, best_of_column)
+    return row[mutual], free[column[mutual]]
 
 
 def _gather(
@@ -122,15 +230,12 @@ def _choose_points(landmark: Index, camera: Index, count: int, per_camera: int) 
 
 
 def _optimise(
-    cameras: Sequence[Camera],
-    maps: Sequence[CameraMap],
-    wSm: Mapping[int, Similarity],
-    observations: Observations,
-) -> tuple[dict[tuple[int, int], Array], Array]:
+    cameras: Sequence[Camera], wTc: Mapping[tuple[int, int], Array], observations: Observations
+) -> tuple[dict[tuple[int, int], Array], Observations]:
+    """Bundle adjustment with a redescending loss; sightings that do not fit afterwards are dropped."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for camera, similarity in wSm.items():
-        for frame, wTc in enumerate(similarity.transform_poses(maps[camera].mTc)):
-            values.insert(X(camera, frame), gtsam.Pose3(wTc))
+    for (camera, frame), pose in wTc.items():
+        values.insert(X(camera, frame), gtsam.Pose3(pose))
     landmark_key = [gtsam.symbol("l", index) for index in range(len(observations.points))]
     for key, point in zip(landmark_key, observations.points, strict=True):
         values.insert(key, point)
@@ -139,47 +244,64 @@ def _optimise(
     )
     calibrations = [gtsam.Cal3_S2(c.fx, c.fy, 0.0, c.cx, c.cy) for c in cameras]
     for landmark, camera, frame, pixel in zip(
-        observations.landmark.tolist(), observations.camera.tolist(), observations.frame.tolist(),
-        observations.pixel, strict=True,
-    ):  # fmt: skip
+        observations.landmark.tolist(),
+        observations.camera.tolist(),
+        observations.frame.tolist(),
+        observations.pixel,
+        strict=True,
+    ):
         graph.add(
             gtsam.GenericProjectionFactorCal3_S2(
                 pixel, noise, X(camera, frame), landmark_key[landmark], calibrations[camera], False, False
             )
         )
-    _fix_gauge(graph, values, maps, wSm, observations, landmark_key)
+    _fix_gauge(graph, wTc, observations, landmark_key)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(25)
-    parameters.setRelativeErrorTol(1e-4)
+    parameters.setRelativeErrorTol(1e-3)
     solution = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    wTc = {
-        (camera, frame): solution.atPose3(X(camera, frame)).matrix()
-        for camera in wSm
-        for frame in range(len(maps[camera].times))
-    }
-    return wTc, np.array([solution.atPoint3(key) for key in landmark_key]).reshape(-1, 3)
+    solved = {label: solution.atPose3(X(*label)).matrix() for label in wTc}
+    points = np.array([solution.atPoint3(key) for key in landmark_key]).reshape(-1, 3)
+    return solved, _fitting(cameras, solved, replace(observations, points=points))
+
+
+def _fitting(
+    cameras: Sequence[Camera], wTc: Mapping[tuple[int, int], Array], observations: Observations
+) -> Observations:
+    error = np.full(len(observations.landmark), np.inf)
+    for (camera, frame), pose in wTc.items():
+        here = (observations.camera == camera) & (observations.frame == frame)
+        points = observations.points[observations.landmark[here]]
+        pixels, _ = project(transform_points(invert_pose(pose), points), cameras[camera].intrinsics)
+        distance = np.linalg.norm(pixels - observations.pixel[here], axis=1)
+        error[here] = np.nan_to_num(distance, nan=np.inf)
+    fits = error < MISFIT_PX
+    fits &= (
+        np.bincount(observations.landmark[fits], minlength=len(observations.points))[observations.landmark]
+        >= 2
+    )
+    used, compact = np.unique(observations.landmark[fits], return_inverse=True)
+    return Observations(
+        compact.ravel(),
+        observations.camera[fits],
+        observations.frame[fits],
+        observations.pixel[fits],
+        observations.points[used],
+    )
 
 
 def _fix_gauge(
     graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    maps: Sequence[CameraMap],
-    wSm: Mapping[int, Similarity],
+    wTc: Mapping[tuple[int, int], Array],
     observations: Observations,
     landmark_key: list[int],
 ) -> None:
     """Hold one pose, and the scale by the pose farthest from it; a breath of a prior on every point."""
-    anchor = min(wSm)
-    wTc = wSm[anchor].transform_poses(maps[anchor].mTc)
-    graph.add(pose_prior(X(anchor, 0), wTc[0], 1e-5, 1e-5))
-    ends = [
-        (float(np.linalg.norm(values.atPose3(X(camera, frame)).translation() - wTc[0, :3, 3])), camera, frame)
-        for camera in wSm
-        for frame in range(len(maps[camera].times))
-    ]
-    _, camera, frame = max(ends)
-    far = values.atPose3(X(camera, frame)).matrix()
-    graph.add(pose_prior(X(camera, frame), far, 1e3, 1e-3))
+    anchor = min(wTc)
+    graph.add(pose_prior(X(*anchor), wTc[anchor], 1e-5, 1e-5))
+    origin = wTc[anchor][:3, 3]
+    far = max(wTc, key=lambda label: float(np.linalg.norm(wTc[label][:3, 3] - origin)))
+    graph.add(pose_prior(X(*far), wTc[far], 1e3, 1e-3))
     # Median depth is 1: this only matters for points that hardly anything constrains.
     loose = gtsam.noiseModel.Isotropic.Sigma(3, 10.0)
     for key, point in zip(landmark_key, observations.points, strict=True):
@@ -187,10 +309,11 @@ def _fix_gauge(
 
 
 def _start_frame(
-    camera: int, frame: int, camera_map: CameraMap, wTc: Array, observations: Observations, points: Array
+    camera: int, frame: int, camera_map: CameraMap, wTc: Array, observations: Observations
 ) -> StartFrame:
     seen = (observations.camera == camera) & (observations.frame == frame)
-    depth = transform_points(invert_pose(wTc), points[observations.landmark[seen]])[:, 2]
+    points = observations.points[observations.landmark[seen]]
+    depth = transform_points(invert_pose(wTc), points)[:, 2]
     front = depth > 0.0
     return StartFrame(
         time=int(camera_map.times[frame]), wTc=wTc, pixels=observations.pixel[seen][front], depth=depth[front]

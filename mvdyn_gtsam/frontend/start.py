@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,3 +30,38 @@ class Start:
     """Camera indices that share a world frame; every camera is in exactly one group."""
     frames: tuple[tuple[StartFrame, ...], ...]
     """Per camera, in time order, at least one."""
+
+
+def start_to_arrays(start: Start) -> dict[str, npt.NDArray[np.float64]]:
+    """Plain arrays that ``start_from_arrays`` turns back into the start."""
+    frames = [(camera, frame) for camera, own in enumerate(start.frames) for frame in own]
+    group_of = {camera: group for group, members in enumerate(start.groups) for camera in members}
+    return {
+        "group": np.array([group_of[camera] for camera in range(len(start.frames))], np.float64),
+        "camera": np.array([camera for camera, _ in frames], np.float64),
+        "time": np.array([frame.time for _, frame in frames], np.float64),
+        "wTc": np.stack([frame.wTc for _, frame in frames]),
+        "count": np.array([len(frame.depth) for _, frame in frames], np.float64),
+        "pixels": np.concatenate([frame.pixels for _, frame in frames]),
+        "depth": np.concatenate([frame.depth for _, frame in frames]),
+    }
+
+
+def start_from_arrays(arrays: Mapping[str, npt.NDArray[np.float64]]) -> Start:
+    """The inverse of ``start_to_arrays``."""
+    group = arrays["group"].astype(int)
+    splits = np.cumsum(arrays["count"].astype(int))[:-1]
+    frames: list[list[StartFrame]] = [[] for _ in group]
+    for camera, time, wTc, pixels, depth in zip(
+        arrays["camera"].astype(int),
+        arrays["time"].astype(int),
+        arrays["wTc"],
+        np.split(arrays["pixels"], splits),
+        np.split(arrays["depth"], splits),
+        strict=True,
+    ):
+        frames[camera].append(StartFrame(int(time), wTc, pixels, depth))
+    return Start(
+        groups=tuple(tuple(np.flatnonzero(group == number).tolist()) for number in range(group.max() + 1)),
+        frames=tuple(tuple(own) for own in frames),
+    )

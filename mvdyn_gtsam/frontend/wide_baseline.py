@@ -21,7 +21,7 @@ from mvdyn_gtsam.errors import ConfigError, TrackingError
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map
 from mvdyn_gtsam.frontend.features import extract_features
-from mvdyn_gtsam.frontend.joint_adjustment import adjust_maps
+from mvdyn_gtsam.frontend.joint_adjustment import AdjustmentConfig, adjust_maps
 from mvdyn_gtsam.frontend.placement import (
     PlacementConfig,
     PointMatches,
@@ -60,11 +60,10 @@ class WideBaselineConfig:
     """Share of favourable testimony a placement needs. Source: experiments/wide_baseline.py."""
     minimum_agreement: float = 0.02
     """Agreeing share of the image per frame pair it needs. Source: as above."""
-    points_per_camera: int = 800
-    """Points of one camera alone that enter the joint adjustment. Source: choice, time."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     dense_map: DenseMapConfig = field(default_factory=DenseMapConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
+    adjustment: AdjustmentConfig = field(default_factory=AdjustmentConfig)
 
     def __post_init__(self) -> None:
         if min(self.maximum_frames, self.neighbours) < 2 or self.features < 100:
@@ -123,7 +122,7 @@ class ClassicalInitializer:
                 for a, b in matches
                 if a in group and b in group
             ]
-            frames |= adjust_maps(capture.cameras, maps, group, same_point, config.points_per_camera)
+            frames |= adjust_maps(capture.cameras, maps, group, same_point, config.adjustment)
         for camera_map in maps:
             if camera_map.camera not in dense:
                 groups.append({camera_map.camera: Similarity.identity()})

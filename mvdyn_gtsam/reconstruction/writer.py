@@ -134,6 +134,11 @@ class ReconstructionWriter:
         np.savez(buffer, allow_pickle=False, **dict(arrays))
         write_atomically(arrays_path(self.folder, name), buffer.getvalue())
 
+    def read_arrays(self, name: str) -> dict[str, npt.NDArray[Any]]:
+        """What ``write_arrays`` wrote, in this run or in the one that is resumed."""
+        with np.load(arrays_path(self.folder, name), allow_pickle=False) as arrays:
+            return dict(arrays)
+
     def set_groups(self, groups: Sequence[Sequence[str]]) -> None:
         """Set the lists of cameras that share a world frame; every camera may be in one group at most."""
         for group in groups:

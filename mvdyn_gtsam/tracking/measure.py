@@ -86,7 +86,9 @@ class EdgeMeasurer:
         view = self._views[i.camera]
         seen = reproject(view.rays, i.log_depth, i.wTc, j.wTc[None], view.intrinsics[None])
         length = np.linalg.norm(seen.pixels[0] - view.grid.pixels, axis=1)
-        return float(np.mean(np.where(seen.valid[0], np.minimum(length, view.camera.width), view.camera.width)))
+        return float(
+            np.mean(np.where(seen.valid[0], np.minimum(length, view.camera.width), view.camera.width))
+        )
 
     def _store(self, i: Keyframe, j: Keyframe, pair: FlowPair) -> None:
         forward, backward = sample_pair(pair, self._views[i.camera].grid, self._views[j.camera].grid)

@@ -75,6 +75,9 @@ class Keyframe:
     guides: dict[Frame, Guide] = field(default_factory=dict)
     """What the flow to a neighbour was guided by; neighbours measured without guidance have no entry."""
 
+    noise_ratio: float = 1.0
+    """Noise of this keyframe's flow over the configured one, at least 1: estimated from its residuals."""
+
     @property
     def frame(self) -> Frame:
         return self.camera, self.time
@@ -92,6 +95,7 @@ def measurement_of(
     """The keyframe's flow to ``neighbours`` as the factor wants it.
 
     ``thin`` takes every second grid point, as on a checkerboard; ``robust_px`` replaces the configured one.
+    Robust scale and noise grow with the keyframe's own noise: blurred or fast frames are measured worse.
     """
     view = views[keyframe.camera]
     flows = [keyframe.flows[frame] for frame in neighbours]
@@ -104,8 +108,8 @@ def measurement_of(
         intrinsics_j=np.stack([views[camera].intrinsics for camera, _ in neighbours]),
         target=np.stack([flow.target[points] for flow in flows]),
         weight=np.stack([flow.weight[points] for flow in flows]),
-        robust_px=config.robust_px if robust_px is None else robust_px,
-        noise_px=config.noise_px,
+        robust_px=keyframe.noise_ratio * (config.robust_px if robust_px is None else robust_px),
+        noise_px=keyframe.noise_ratio * config.noise_px,
         steps=steps,
     )
 

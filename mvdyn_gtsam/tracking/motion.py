@@ -101,7 +101,9 @@ def pnp_pose(seen: Correspondences, intrinsics: Array, threshold_px: float) -> A
     good = seen.weight > 0.3
     if good.sum() < 12:
         return None
-    matrix = np.array([[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]])
+    matrix = np.array(
+        [[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]]
+    )
     cv2.setRNGSeed(0)
     found, rotation, translation, _ = cv2.solvePnPRansac(
         seen.w_points[good],

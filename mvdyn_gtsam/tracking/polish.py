@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factors.keys import S, X
+from factors.projection import reproject
 from mvdyn_gtsam.config import TrackingConfig
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.tracking.keyframe_factor import keyframe_factor
@@ -62,6 +63,32 @@ def solve_all(
     solve = PolishSolve(before, optimizer.error(), optimizer.iterations())
     logger.debug("polish: %.1f -> %.1f in %d iterations", *vars(solve).values())
     return solve
+
+
+def estimate_noise(
+    keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig
+) -> None:
+    """Set every keyframe's ``noise_ratio`` from the weighted median of its residuals at the current poses."""
+    frames = {keyframe.frame: keyframe for keyframe in keyframes}
+    for keyframe in keyframes:
+        neighbours = [frame for frame in useful_neighbours(keyframe) if frame in frames]
+        if not neighbours:
+            continue
+        view = views[keyframe.camera]
+        intrinsics = np.stack([views[camera].intrinsics for camera, _ in neighbours])
+        wTj = np.stack([frames[frame].wTc for frame in neighbours])
+        seen = reproject(view.rays, keyframe.log_depth, keyframe.wTc, wTj, intrinsics)
+        target = np.stack([keyframe.flows[frame].target for frame in neighbours])
+        weight = np.stack([keyframe.flows[frame].weight for frame in neighbours])
+        residual = np.linalg.norm(seen.pixels - target, axis=2)
+        noise = config.noise_per_residual * _weighted_median(residual.ravel(), weight.ravel())
+        keyframe.noise_ratio = float(np.clip(noise, config.noise_px, config.max_noise_px)) / config.noise_px
+
+
+def _weighted_median(values: npt.NDArray[np.float64], weight: npt.NDArray[np.float32]) -> float:
+    order = np.argsort(values, kind="stable")
+    cumulative = np.cumsum(weight[order], dtype=np.float64)
+    return float(values[order[np.searchsorted(cumulative, 0.5 * cumulative[-1])]])
 
 
 def marginal_covariances(

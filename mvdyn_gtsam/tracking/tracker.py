@@ -237,7 +237,12 @@ class Tracker:
                     continue
                 others = [other for other in track if self._images.available(other.frame)]
                 edges = inter_camera_edges(
-                    frame, others, self._views, self._graph, self._graph_config, self._graph_config.st_per_frame
+                    frame,
+                    others,
+                    self._views,
+                    self._graph,
+                    self._graph_config,
+                    self._graph_config.st_per_frame,
                 )
                 for edge in edges:
                     other = self._frames[edge.j]
@@ -398,7 +403,9 @@ class Tracker:
         usable = [source for source in sources if frame.frame in source.flows]
         last = usable[0]
         times = [source.time for source in sources]
-        fit = self._locate(frame, usable, [frame.wTc, predict_pose(times, [s.wTc for s in sources], frame.time)])
+        fit = self._locate(
+            frame, usable, [frame.wTc, predict_pose(times, [s.wTc for s in sources], frame.time)]
+        )
         self._carry_depth(frame, last)
         for source in usable:
             del source.flows[frame.frame]
@@ -448,7 +455,9 @@ class Tracker:
 
     def _check_step(self, time: int, frames: Sequence[Image]) -> None:
         if time != self._last_time + 1:
-            raise TrackingError(f"instant {time} was handed in after {self._last_time}; hand in every one in order")
+            raise TrackingError(
+                f"instant {time} was handed in after {self._last_time}; hand in every one in order"
+            )
         if len(frames) != len(self._views):
             raise TrackingError(f"instant {time}: {len(frames)} frames for {len(self._views)} cameras")
         for view, image in zip(self._views, frames, strict=True):
@@ -463,7 +472,9 @@ class Tracker:
 def _check_start(cameras: Sequence[Camera], start: Start) -> None:
     members = sorted(camera for group in start.groups for camera in group)
     if members != list(range(len(cameras))) or len(start.frames) != len(cameras):
-        raise TrackingError(f"the start's groups {start.groups} do not hold each of {len(cameras)} cameras once")
+        raise TrackingError(
+            f"the start's groups {start.groups} do not hold each of {len(cameras)} cameras once"
+        )
     for camera, frames in zip(cameras, start.frames, strict=True):
         if not frames or all(len(frame.depth) == 0 for frame in frames):
             raise TrackingError(f"the start has no depths for camera {camera.name}")
