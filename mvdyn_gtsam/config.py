@@ -53,11 +53,14 @@ class GraphConfig:
     st_overlap: float = 0.2
     """Visible share of the grid that a spatio-temporal edge needs. Source: experiments/tracking_sweep.py."""
     st_per_frame: int = 1
-    """New inter-camera edges per keyframe and other camera, at most. Source: max_active_edges over the window."""
+    """New inter-camera edges per keyframe and other camera, at most. Source: max_active_edges over the
+    window."""
     st_separation: int = 4
-    """Frames between two spatio-temporal edges of one keyframe, at least. Source: choice, half an offset-8 edge."""
+    """Frames between two spatio-temporal edges of one keyframe, at least. Source: choice, half an offset-8
+    edge."""
     long_range_per_frame: int = 2
-    """Long-range edges of the polish per keyframe to its own camera. Source: experiments/tracking_sweep.py."""
+    """Long-range edges of the polish per keyframe to its own camera. Source:
+    experiments/tracking_sweep.py."""
     long_range_separation: int = 12
     """Keyframes between the ends of a long-range edge, at least. Source: DESIGN 5 (+-16, +-24 worked)."""
     polish_per_frame: int = 2
@@ -92,8 +95,8 @@ class TrackingConfig:
     grid_points: int = 768
     """Grid points per frame, about. Source: DESIGN 5."""
     keyframe_px: float = 2.0
-    """Mean flow since the last keyframe that makes a new one, px. Source: experiments/tracking_sweep.py (DROID
-    and MegaSAM take 16 to 19 px at full resolution)."""
+    """Mean flow since the last keyframe that makes a new one, px. Source: experiments/tracking_sweep.py
+    (DROID and MegaSAM take 16 to 19 px at full resolution)."""
     guided_px: float = 16.0
     """Mean predicted flow beyond which temporal flow is guided by depth and poses, px. Source:
     experiments/tracking_sweep.py."""
@@ -104,7 +107,7 @@ class TrackingConfig:
     noise_px: float = 0.2
     """Standard deviation of flow of weight one, px. Source: measured against the true flow of the rendered
     scenes (median 0.11 to 0.22 px); too large a value lets the depth prior bias the poses."""
-    noise_per_residual: float = 1.5
+    noise_per_residual: float = 2.0
     """Noise of a keyframe's flow over the median of its residuals. Source: experiments/tracking_sweep.py."""
     max_noise_px: float = 1.0
     """Largest noise a keyframe's flow is taken to have, px. Source: DESIGN 5 (Cauchy, ~1 px)."""
@@ -121,13 +124,14 @@ class TrackingConfig:
     """iSAM2 updates per time step. Source: experiments/tracking_sweep.py."""
     polish_rounds: int = 2
     """Times the polish measures long-range edges and solves. Source: experiments/tracking_sweep.py."""
-    polish_iterations: int = 8
+    polish_iterations: int = 12
     """Levenberg-Marquardt iterations per solve of the polish. Source: experiments/tracking_sweep.py."""
     remeasure_px: float = 0.3
     """Median change of a guided flow's prediction beyond which the polish measures it again, px. Source:
     experiments/tracking_sweep.py."""
     polish_tolerance: float = 1e-6
-    """Relative decrease of the cost at which a solve of the polish ends. Source: experiments/tracking_sweep.py."""
+    """Relative decrease of the cost at which a solve of the polish ends. Source:
+    experiments/tracking_sweep.py."""
     image_cache_mb: int = 256
     """Memory for frames held or read again. Source: choice, 400 frames of 512x384."""
 

@@ -46,7 +46,7 @@ def interpolate_pose(aTb: Array, aTc: Array, fraction: float) -> Array:
 
 
 def backproject(pixels: Array, depth: Array, intrinsics: Array) -> Array:
-    """Camera-frame points ``(N, 3)`` of pixels ``(N, 2)`` at z-depths ``(N,)``; ``intrinsics`` is ``(3, 3)``."""
+    """Camera-frame points ``(N, 3)`` of pixels ``(N, 2)`` at z-depths ``(N,)``; ``intrinsics (3, 3)``."""
     rays = pixel_rays(pixels, intrinsics)
     return rays * depth[:, None]
 

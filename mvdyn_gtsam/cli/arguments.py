@@ -7,11 +7,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mvdyn_gtsam.config import Config, load_config
 from mvdyn_gtsam.errors import CaptureError
 
 if TYPE_CHECKING:
     from mvdyn_gtsam.capture import Capture
+    from mvdyn_gtsam.config import Config
 
 
 def add_capture_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +55,8 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
 
 def read_config(arguments: argparse.Namespace) -> Config:
     """The configuration the arguments ask for. Raises ConfigError."""
+    from mvdyn_gtsam.config import load_config
+
     overrides = list(arguments.overrides)
     if getattr(arguments, "truncate", False):
         overrides.append("capture.truncate=true")

@@ -1,4 +1,4 @@
-"""Bundle adjustment of all placed maps together: what each camera's own map left uncertain, the others fix."""
+"""Bundle adjustment of all placed maps together: what one camera's map leaves uncertain, the others fix."""
 
 from __future__ import annotations
 

@@ -106,9 +106,8 @@ def match_maps(map_a: CameraMap, map_b: CameraMap, config: PlacementConfig) -> P
             observations.append(np.column_stack([point_a, point_b, frames, pairs])[both])
     table = np.concatenate(observations) if observations else np.zeros((0, 6), np.int64)
     if len(table) == 0:
-        empty = np.zeros
-        return PointMatches(empty((0, 2), np.int64), empty((0, 3)), empty((0, 3)), empty((0, 4, 4)), empty((0, 4, 4)),
-                            empty((0, 2)), empty((0, 2)), empty(0))  # fmt: skip
+        point, pose, pixel = np.zeros((0, 3)), np.zeros((0, 4, 4)), np.zeros((0, 2))
+        return PointMatches(pixel.astype(np.int64), point, point, pose, pose, pixel, pixel, np.zeros(0))
     _, first, votes = np.unique(table[:, :2], axis=0, return_index=True, return_counts=True)
     rows = table[first]
     return PointMatches(
@@ -132,7 +131,7 @@ def propose_placements(
     a large repeated texture cannot hide what else would fit.
     """
     random = np.random.default_rng(0)
-    scorer = _Scorer(matches, intrinsics_a, intrinsics_b, config)
+    scorer = PlacementScorer(matches, intrinsics_a, intrinsics_b, config)
     found: list[Hypothesis] = []
     remaining = np.ones(len(matches), bool)
     for _ in range(3):
@@ -160,22 +159,24 @@ def agreeing_pairs(
     """Rows ``(K, 2)`` of the map points of a and b that are one if the placement is true."""
     if len(matches) == 0:
         return np.zeros((0, 2), np.int64)
-    errors = _Scorer(matches, intrinsics_a, intrinsics_b, config).errors(aSb)
+    errors = PlacementScorer(matches, intrinsics_a, intrinsics_b, config).errors(aSb)
     return matches.rows[errors < config.inlier_px]
 
 
-def refine_placement(aSb: Similarity, matches: PointMatches, scorer: _Scorer) -> Similarity:
+def refine_placement(aSb: Similarity, matches: PointMatches, scorer: PlacementScorer) -> Similarity:
     """Least squares on the reprojections, both ways, of the matches that support ``aSb``."""
     for _ in range(3):
         near = scorer.errors(aSb) < 2.0 * scorer.config.inlier_px
         if near.sum() < 4:
             return aSb
-        chosen = _Scorer(matches.subset(near), scorer.intrinsics_a, scorer.intrinsics_b, scorer.config)
+        chosen = PlacementScorer(
+            matches.subset(near), scorer.intrinsics_a, scorer.intrinsics_b, scorer.config
+        )
         aSb = _fit(aSb, chosen)
     return aSb
 
 
-def _fit(aSb: Similarity, scorer: _Scorer) -> Similarity:
+def _fit(aSb: Similarity, scorer: PlacementScorer) -> Similarity:
     def moved(step: Array) -> Similarity:
         rotation = aSb.rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
         return Similarity(aSb.scale * float(np.exp(step[6])), rotation, aSb.translation + step[3:6])
@@ -188,8 +189,8 @@ def _fit(aSb: Similarity, scorer: _Scorer) -> Similarity:
     return moved(solution.x)
 
 
-class _Scorer:
-    """Reprojection errors and support of placements; a plain closure over the matches."""
+class PlacementScorer:
+    """Reprojection errors and support of placements, for one set of matches."""
 
     def __init__(
         self, matches: PointMatches, intrinsics_a: Array, intrinsics_b: Array, config: PlacementConfig
@@ -213,6 +214,7 @@ class _Scorer:
         return np.nan_to_num(worse, nan=np.inf)
 
     def hypothesis(self, aSb: Similarity) -> Hypothesis:
+        """``aSb`` with what speaks for it."""
         errors = self.errors(aSb)
         value = np.maximum(0.0, 1.0 - (errors / self.config.inlier_px) ** 2) * np.minimum(
             self.matches.votes, 5.0
@@ -227,7 +229,7 @@ class _Scorer:
 def _search(
     matches: PointMatches,
     usable: npt.NDArray[np.bool_],
-    scorer: _Scorer,
+    scorer: PlacementScorer,
     random: np.random.Generator,
     config: PlacementConfig,
 ) -> list[Hypothesis]:
@@ -248,7 +250,7 @@ def _search(
     return best
 
 
-def _count_inliers(scale: Array, rotation: Array, translation: Array, scorer: _Scorer) -> Array:
+def _count_inliers(scale: Array, rotation: Array, translation: Array, scorer: PlacementScorer) -> Array:
     """Votes within the inlier distance in camera a for each of H similarities; ``(H,)``."""
     matches, config = scorer.matches, scorer.config
     # At most 400 matches, the most voted: this only ranks samples before they are scored in full.
@@ -265,7 +267,7 @@ def _count_inliers(scale: Array, rotation: Array, translation: Array, scorer: _S
 
 
 def _fit_three(points_a: Array, points_b: Array) -> tuple[Array, Array, Array]:
-    """Similarities ``aSb`` of H samples ``(H, 3, 3)`` (Umeyama 1991); scale 0 where the sample does not fit."""
+    """Similarities ``aSb`` of H samples ``(H, 3, 3)`` (Umeyama 1991); scale 0 where a sample does not fit."""
     mean_a, mean_b = points_a.mean(1, keepdims=True), points_b.mean(1, keepdims=True)
     centred_a, centred_b = points_a - mean_a, points_b - mean_b
     left, singular, right = np.linalg.svd(np.swapaxes(centred_a, 1, 2) @ centred_b)

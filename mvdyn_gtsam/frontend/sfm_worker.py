@@ -18,6 +18,10 @@ import pycolmap
 PIXEL_CENTRE = 0.5
 """COLMAP puts the centre of the first pixel at 0.5."""
 
+TWO_VIEW_PX = 1.0
+"""Epipolar error up to which a match fits a camera's motion. COLMAP's default of 4 let the flow of a person
+who walked by pass as rigid motion and put whole cameras' maps wrong."""
+
 
 def main(source: str, target: str) -> int:
     problem = np.load(source)
@@ -49,7 +53,7 @@ def _write_database(path: Path, problem: Any) -> None:
     options = pycolmap.TwoViewGeometryOptions()
     options.compute_relative_pose = True
     options.ransac.random_seed = 0
-    options.ransac.max_error = float(problem["inlier_px"]) if "inlier_px" in problem else 1.0
+    options.ransac.max_error = TWO_VIEW_PX
     with pycolmap.Database.open(path) as database:
         camera.camera_id = database.write_camera(camera)
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera.camera_id)

@@ -110,13 +110,12 @@ def build_camera_maps(
             command = [sys.executable, "-m", "mvdyn_gtsam.frontend.sfm_worker", str(problem)]
             if len(running) >= (os.cpu_count() or 1):
                 running.pop(0).wait()
-            job = subprocess.Popen(
-                [*command, f"{folder}/{index}.out.npz"],
-                stdout=subprocess.DEVNULL,
-                stderr=(Path(folder) / f"{index}.log").open("wb"),
-            )
-            jobs.append(job)
-            running.append(job)
+            with (Path(folder) / f"{index}.log").open("wb") as log_file:
+                process = subprocess.Popen(
+                    [*command, f"{folder}/{index}.out.npz"], stdout=subprocess.DEVNULL, stderr=log_file
+                )
+            jobs.append(process)
+            running.append(process)
         maps = []
         for index, job in enumerate(jobs):
             camera_features = tuple(features[index])

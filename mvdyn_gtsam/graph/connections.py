@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 
 Frame = tuple[int, int]
 """``(camera, time)``"""
 
 
-class EdgeKind(str, Enum):
+class EdgeKind(StrEnum):
     """The three kinds of the paper, and the long-range ones of the polish."""
 
     TEMPORAL = "temporal"

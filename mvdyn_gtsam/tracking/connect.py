@@ -1,4 +1,4 @@
-"""Which keyframes to connect, from their poses and depths: the tracker's and the polish's questions to graph/."""
+"""Which keyframes to connect, from their poses and depths: what tracker and polish ask of graph/."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def inter_camera_edges(
     times = np.array([other.time for other in candidates])
     edges: list[Edge] = []
     same_instant = np.flatnonzero(times == keyframe.time)
-    for index in same_instant:
+    for index in same_instant.tolist():
         if inside[index] > config.spatial_overlap and score[index] > 0:
             edges.append(Edge(keyframe.frame, candidates[index].frame, EdgeKind.SPATIAL))
             score[index] = 0.0

@@ -23,7 +23,7 @@ def keyframe_factor(
     fixed: Mapping[Frame, Array],
     measure: Callable[[], StructurelessMeasurement],
 ) -> gtsam.CustomFactor:
-    """Factor over ``X(frame)``, ``X`` of the neighbours that are not ``fixed`` (poses ``(4, 4)``), ``S(frame)``.
+    """Factor over ``X(frame)``, ``X`` of neighbours not ``fixed`` (poses ``(4, 4)``), ``S(frame)``.
 
     ``measure`` builds the measurement, the same every time: called at each linearisation, it spares keeping
     the measurements of all keyframes in double precision at once.

@@ -149,8 +149,8 @@ class TrackingResult:
     wTc: Array
     """``(N, T, 4, 4)``"""
     covariance: Array
-    """``(N, T, 6, 6)`` marginal covariance, tangent ``[omega, v]``; for keyframes from the graph, for the others
-    with their keyframes held fixed."""
+    """``(N, T, 6, 6)`` marginal covariance, tangent ``[omega, v]``; for keyframes from the graph, for the
+    others with their keyframes held fixed."""
     keyframe_times: tuple[tuple[int, ...], ...]
     """Per camera."""
     grids: tuple[Grid, ...]

@@ -79,7 +79,8 @@ def refine_pose(
     cost, gradient, hessian, squared = _system(w_points, target, weight, intrinsics, wTc, robust_px)
     damping = 1e-4
     for _ in range(iterations):
-        step = np.linalg.solve(hessian + damping * np.diag(np.diagonal(hessian) + 1e-9), -gradient)
+        damped = hessian + damping * np.diag(np.diagonal(hessian) + 1e-9)
+        step = np.asarray(np.linalg.solve(damped, -gradient), np.float64)
         candidate = _retract(wTc, step)
         system = _system(w_points, target, weight, intrinsics, candidate, robust_px)
         if system[0] <= cost:

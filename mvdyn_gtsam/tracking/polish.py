@@ -65,9 +65,15 @@ def solve_all(
     return solve
 
 
-def estimate_noise(
-    keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig
-) -> None:
+def total_cost(keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig) -> float:
+    """Robust cost of all flow at the current poses, with the window's wider loss."""
+    graph, values = build_graph(
+        keyframes, views, config, lambda _: [], thin=True, robust_px=config.window_robust_px
+    )
+    return float(graph.error(values))
+
+
+def estimate_noise(keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig) -> None:
     """Set every keyframe's ``noise_ratio`` from the weighted median of its residuals at the current poses."""
     frames = {keyframe.frame: keyframe for keyframe in keyframes}
     for keyframe in keyframes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from time import perf_counter
 
 import gtsam
@@ -18,6 +19,7 @@ from mvdyn_gtsam.config import Config
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig
 from mvdyn_gtsam.frontend.start import Start, StartFrame
+from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import ConnectionGraph, Edge, EdgeKind, Frame
 from mvdyn_gtsam.tracking.connect import inter_camera_edges, long_range_edges
 from mvdyn_gtsam.tracking.depth import carried_log_depth, sparse_log_depth
@@ -34,7 +36,7 @@ from mvdyn_gtsam.tracking.model import (
 )
 from mvdyn_gtsam.tracking.motion import Correspondences, PoseFit, locate, predict_pose, world_points
 from mvdyn_gtsam.tracking.normalise import normalised_start
-from mvdyn_gtsam.tracking.polish import marginal_covariances, solve_all
+from mvdyn_gtsam.tracking.polish import estimate_noise, marginal_covariances, solve_all, total_cost
 from mvdyn_gtsam.tracking.window import SlidingWindow, solve_depth, useful_neighbours
 
 logger = logging.getLogger(__name__)
@@ -45,8 +47,8 @@ Array = npt.NDArray[np.float64]
 class Tracker:
     """Poses of all cameras, instant by instant, from a wide-baseline start.
 
-    Call ``step`` once per instant, in order and without gaps, then ``finish``. ``read(camera, time)`` hands out
-    earlier frames again; without it only frames still held in memory can get new connections.
+    Call ``step`` once per instant, in order and without gaps, then ``finish``. ``read(camera, time)`` hands
+    out earlier frames again; without it only frames still held in memory can get new connections.
     """
 
     def __init__(
@@ -223,7 +225,7 @@ class Tracker:
         self._add_edges(edges)
 
     def _forget_candidates(self, frame: Keyframe) -> None:
-        """Flow of frames that were no keyframes is measured again at the end, against keyframes on both sides."""
+        """Flow of frames that were no keyframes is measured again at the end, to keyframes on both sides."""
         track = self._tracks[frame.camera]
         if track:
             last = track[-1]
@@ -301,6 +303,7 @@ class Tracker:
         return self._result(covariance)
 
     def _polish(self, keyframes: list[Keyframe]) -> None:
+        self._take_better_start(keyframes)
         for polish_round in range(self._tracking.polish_rounds + 1):
             if polish_round > 0:
                 began = perf_counter()
@@ -313,10 +316,46 @@ class Tracker:
             solve_all(
                 keyframes, self._views, self._tracking, self._priors, thin=not last, robust_px=robust_px
             )
+            if not last:
+                estimate_noise(keyframes, self._views, self._tracking)
             self._time("polish solve", began)
 
+    def _take_better_start(self, keyframes: list[Keyframe]) -> None:
+        """Begin the polish, group by group, from what was tracked or from that bent to the start, by the cost.
+
+        The window sees only the past and wanders where parallax is low; the start saw the whole video, but
+        may be wrong.
+        """
+        for group in self._start.groups:
+            members = [keyframe for keyframe in keyframes if keyframe.camera in group]
+            bent = [replace(keyframe, wTc=self._bent_pose(keyframe)) for keyframe in members]
+            costs = []
+            for candidates in (members, bent):
+                frames = {keyframe.frame: keyframe for keyframe in candidates}
+                for keyframe in candidates:
+                    solve_depth(keyframe, frames, self._views, self._tracking)
+                costs.append(total_cost(candidates, self._views, self._tracking))
+            logger.debug("group %s: cost as tracked %.4g, bent to the start %.4g", group, *costs)
+            if costs[1] < costs[0]:
+                for keyframe, other in zip(members, bent, strict=True):
+                    keyframe.wTc, keyframe.log_depth = other.wTc, other.log_depth
+                    keyframe.information = other.information
+
+    def _bent_pose(self, keyframe: Keyframe) -> Array:
+        """The tracked pose moved by what separates tracking from the start around that time."""
+        start = self._start.frames[keyframe.camera]
+        tracked = {k.time: k.wTc for k in self._tracks[keyframe.camera]}
+        common = [frame for frame in start if frame.time in tracked]
+        if not common:
+            return keyframe.wTc
+        # nearest outside the common times: a correction must not be extrapolated
+        time = min(max(keyframe.time, common[0].time), common[-1].time)
+        at_tracked = predict_pose([f.time for f in common], [tracked[f.time] for f in common], time)
+        at_start = predict_pose([f.time for f in common], [f.wTc for f in common], time)
+        return at_start @ invert_pose(at_tracked) @ keyframe.wTc
+
     def _remeasure(self, add: bool) -> None:
-        """Measure guided edges anew with today's depth and poses; with ``add`` choose long-range ones first."""
+        """Measure guided edges anew with today's depth and poses; with ``add`` choose long-range ones."""
         if add:
             for track in self._tracks:
                 for keyframe in track:
@@ -348,7 +387,7 @@ class Tracker:
         """The last frame of every camera becomes a keyframe, so that every other lies between two."""
         new: list[Keyframe] = []
         touched: dict[Frame, Keyframe] = {}
-        for camera, others in enumerate(self._others):
+        for others in self._others:
             if others and others[-1].time == self._last_time:
                 frame = others.pop()
                 self._promote(frame, touched)
@@ -464,8 +503,8 @@ class Tracker:
             size = (view.camera.height, view.camera.width)
             if image.shape[:2] != size:
                 raise TrackingError(
-                    f"instant {time}: camera {view.camera.name} handed a frame of {image.shape[1]}x{image.shape[0]}, "
-                    f"but its intrinsics are for {size[1]}x{size[0]}"
+                    f"instant {time}: camera {view.camera.name} handed a frame of "
+                    f"{image.shape[1]}x{image.shape[0]}, but its intrinsics are for {size[1]}x{size[0]}"
                 )
 
 

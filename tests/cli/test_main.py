@@ -93,12 +93,24 @@ def test_help_teaches_and_is_fast() -> None:
     # In a fresh process: nothing heavy may be loaded before a verb needs it.
     script = (
         "import sys; from mvdyn_gtsam.cli.main import main; code = main(['--help'])\n"
-        "print(sorted({'cv2', 'gtsam', 'scipy', 'pycolmap', 'matplotlib'} & set(sys.modules)), code)"
+        "print(sorted({'numpy', 'cv2', 'gtsam', 'scipy', 'pycolmap', 'matplotlib'} & set(sys.modules)), code)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert last_line(done.stdout) == "[] 0"
     for verb in ("reconstruct", "evaluate", "compare", "export", "demo", "config"):
         assert f"    {verb}" in done.stdout
+
+
+def test_blas_is_kept_to_one_thread_unless_told_otherwise() -> None:
+    script = (
+        "import os; from mvdyn_gtsam.cli.main import main; main(['config', '--toml'])\n"
+        "print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    for given, expected in (({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")):
+        environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"} | given
+        command = [sys.executable, "-c", script]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+        assert last_line(done.stdout) == expected
 
 
 def test_importing_the_package_is_cheap() -> None:

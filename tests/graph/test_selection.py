@@ -20,7 +20,11 @@ def wall_points(depth: float) -> np.ndarray:
     return pixel_rays(np.stack([x, y], -1).reshape(-1, 2), K) * depth
 
 
-def view(translation=(0.0, 0.0, 0.0), depth: float = 4.0, wRc=None) -> View:
+def view(
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    depth: float = 4.0,
+    wRc: np.ndarray | None = None,
+) -> View:
     wTc = np.eye(4)
     wTc[:3, 3] = translation
     if wRc is not None:
@@ -32,33 +36,33 @@ def overlap_with(*views: View, depth: float = 4.0) -> Overlap:
     return predicted_overlap(wall_points(depth), np.zeros(3), views, occlusion_tolerance=0.1)
 
 
-def test_the_same_view_sees_everything_without_parallax():
+def test_the_same_view_sees_everything_without_parallax() -> None:
     overlap = overlap_with(view())
     assert overlap.inside[0] == overlap.visible[0] == 1.0
     assert overlap.parallax_deg[0] == pytest.approx(0.0, abs=1e-5)
 
 
-def test_a_shift_by_a_quarter_of_the_view_leaves_three_quarters():
+def test_a_shift_by_a_quarter_of_the_view_leaves_three_quarters() -> None:
     shift = 0.25 * WIDTH * 4.0 / FOCAL
     overlap = overlap_with(view((shift, 0, 0)))
     assert overlap.inside[0] == pytest.approx(0.75, abs=1.0 / SHAPE[1])
     assert overlap.parallax_deg[0] == pytest.approx(np.degrees(np.arctan2(shift, 4.0)), rel=0.15)
 
 
-def test_points_hidden_behind_something_are_inside_but_not_visible():
+def test_points_hidden_behind_something_are_inside_but_not_visible() -> None:
     overlap = overlap_with(view(depth=2.0))
     assert overlap.inside[0] == 1.0
     assert overlap.visible[0] == 0.0
 
 
-def test_points_behind_the_camera_are_outside():
+def test_points_behind_the_camera_are_outside() -> None:
     turned = np.diag([-1.0, 1.0, -1.0])
     overlap = overlap_with(view(wRc=turned))
     assert overlap.inside[0] == 0.0
     assert edge_score(overlap, 0.0, 60.0)[0] == 0.0
 
 
-def test_score_needs_the_minimum_and_fades_with_the_angle():
+def test_score_needs_the_minimum_and_fades_with_the_angle() -> None:
     overlap = Overlap(np.ones(4), np.array([0.1, 0.5, 0.5, 0.5]), np.array([0.0, 0.0, 30.0, 60.0]))
     score = edge_score(overlap, minimum=0.2, max_parallax_deg=60.0)
     assert score[0] == 0.0
@@ -66,13 +70,13 @@ def test_score_needs_the_minimum_and_fades_with_the_angle():
     assert score[1] > score[2] > score[3] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_choice_takes_the_best_and_keeps_them_apart():
+def test_choice_takes_the_best_and_keeps_them_apart() -> None:
     times = np.arange(20)
     score = np.where(times == 10, 1.0, 0.5 - 0.01 * abs(times - 10))
     assert [int(times[k]) for k in choose_spread(score, times, separation=4, count=3)] == [10, 14, 6]
 
 
-def test_choice_keeps_away_from_what_is_taken_and_skips_what_scores_nothing():
+def test_choice_keeps_away_from_what_is_taken_and_skips_what_scores_nothing() -> None:
     times = np.arange(10)
     score = np.where(times >= 8, 1.0, 0.0)
     assert choose_spread(score, times, separation=3, count=5, taken=[9]) == []
@@ -84,7 +88,7 @@ def test_choice_keeps_away_from_what_is_taken_and_skips_what_scores_nothing():
     st.integers(1, 8),
     st.integers(0, 6),
 )
-def test_choice_is_spread_and_maximal(raw, separation, count):
+def test_choice_is_spread_and_maximal(raw: list[tuple[float, int]], separation: int, count: int) -> None:
     score, times = np.array([s for s, _ in raw]), np.array([t for _, t in raw])
     chosen = choose_spread(score, times, separation, count)
     assert len(chosen) <= count

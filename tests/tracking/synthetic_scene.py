@@ -47,8 +47,8 @@ def render(wTc: np.ndarray, view: Camera) -> tuple[np.ndarray, np.ndarray]:
         offset = wTc[:3, 3] + w_rays * z[..., None] - np.array(point)
         u, v = offset @ a, offset @ b
         hit = (z > 0) & (z < depth) & (abs(u) < half) & (abs(v) < half)
-        where = [(256 + 60 * c).astype(np.float32) for c in (u, v)]
-        colour = cv2.remap(texture(seed), *where, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        x_there, y_there = ((256 + 60 * c).astype(np.float32) for c in (u, v))
+        colour = cv2.remap(texture(seed), x_there, y_there, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         image[hit], depth[hit] = colour[hit], z[hit]
     grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=2), depth
@@ -62,7 +62,13 @@ class Scene:
     images: list[list[np.ndarray]]
     depths: list[list[np.ndarray]]
 
-    def start(self, groups, times=(0, 4, 8), noise: float = 1.0, seed: int = 0) -> Start:
+    def start(
+        self,
+        groups: tuple[tuple[int, ...], ...],
+        times: tuple[int, ...] = (0, 4, 8),
+        noise: float = 1.0,
+        seed: int = 0,
+    ) -> Start:
         """Poses off by about 0.2 degrees and 0.5 % of the depth, sparse depths by 2 %."""
         rng = np.random.default_rng(seed)
         frames = []
