@@ -31,7 +31,8 @@ def main(source: str, target: str) -> int:
         database = Path(folder) / "views.db"
         _write_database(database, problem)
         best = None
-        for mapping in (_global_mapping, _incremental_mapping):
+        few = bool(problem["few_views"]) if "few_views" in problem else False
+        for mapping in (_few_views_mapping,) if few else (_global_mapping, _incremental_mapping):
             for model in mapping(database, Path(folder) / mapping.__name__).values():
                 if best is None or model.num_reg_images() > best.num_reg_images():
                     best = model
@@ -42,11 +43,11 @@ def main(source: str, target: str) -> int:
 
 
 def _write_database(path: Path, problem: Any) -> None:
-    fx, fy, cx, cy = problem["intrinsics"]
-    width, height = (int(x) for x in problem["size"])
-    parameters = [fx, fy, cx + PIXEL_CENTRE, cy + PIXEL_CENTRE]
-    camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=parameters)
-    camera.has_prior_focal_length = True
+    """``intrinsics`` (fx, fy, cx, cy) and ``size`` are one row for all views or one row per view."""
+    sizes = np.atleast_2d(problem["size"])
+    cameras = [
+        _camera(row, size) for row, size in zip(np.atleast_2d(problem["intrinsics"]), sizes, strict=True)
+    ]
     splits = np.cumsum(problem["count"])[:-1]
     keypoints = [pixels + PIXEL_CENTRE for pixels in np.split(problem["pixels"], splits)]
     matches = np.split(problem["matches"].astype(np.uint32), np.cumsum(problem["match_count"])[:-1])
@@ -55,26 +56,38 @@ def _write_database(path: Path, problem: Any) -> None:
     options.ransac.random_seed = 0
     options.ransac.max_error = TWO_VIEW_PX
     with pycolmap.Database.open(path) as database:
-        camera.camera_id = database.write_camera(camera)
-        sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera.camera_id)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(sensor)
-        rig_id = database.write_rig(rig)
+        sensors, rigs = [], []
+        for camera in cameras:
+            camera.camera_id = database.write_camera(camera)
+            sensors.append(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera.camera_id))
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(sensors[-1])
+            rigs.append(database.write_rig(rig))
+        if len(cameras) == 1:
+            cameras, sensors, rigs = ([one[0]] * len(keypoints) for one in (cameras, sensors, rigs))
         ids = []
-        for index, pixels in enumerate(keypoints):
+        for index, (pixels, camera) in enumerate(zip(keypoints, cameras, strict=True)):
             image_id = database.write_image(pycolmap.Image(name=f"{index:06d}", camera_id=camera.camera_id))
             frame = pycolmap.Frame()
-            frame.rig_id = rig_id
-            frame.add_data_id(pycolmap.data_t(sensor, image_id))
+            frame.rig_id = rigs[index]
+            frame.add_data_id(pycolmap.data_t(sensors[index], image_id))
             database.write_frame(frame)
             database.write_keypoints(image_id, pixels.astype(np.float32))
             ids.append(image_id)
         for (first, second), pair in zip(problem["pairs"], matches, strict=True):
             geometry = pycolmap.estimate_calibrated_two_view_geometry(
-                camera, keypoints[first], camera, keypoints[second], pair, options
+                cameras[first], keypoints[first], cameras[second], keypoints[second], pair, options
             )
             database.write_matches(ids[first], ids[second], pair)
             database.write_two_view_geometry(ids[first], ids[second], geometry)
+
+
+def _camera(intrinsics: Any, size: Any) -> Any:
+    fx, fy, cx, cy = intrinsics
+    parameters = [fx, fy, cx + PIXEL_CENTRE, cy + PIXEL_CENTRE]
+    camera = pycolmap.Camera(model="PINHOLE", width=int(size[0]), height=int(size[1]), params=parameters)
+    camera.has_prior_focal_length = True
+    return camera
 
 
 def _global_mapping(database: Path, output: Path) -> dict[int, Any]:
@@ -100,6 +113,22 @@ def _global_mapping(database: Path, output: Path) -> dict[int, Any]:
 
 def _incremental_mapping(database: Path, output: Path) -> dict[int, Any]:
     output.mkdir()
+    return dict(pycolmap.incremental_mapping(database, output, output, _incremental_options()))
+
+
+def _few_views_mapping(database: Path, output: Path) -> dict[int, Any]:
+    """A handful of images far apart: few matches each, so COLMAP's 100 and 30 inliers are out of reach."""
+    output.mkdir()
+    options = _incremental_options()
+    options.min_model_size = 2
+    options.triangulation.ignore_two_view_tracks = False
+    options.mapper.init_min_num_inliers = 20
+    options.mapper.abs_pose_min_num_inliers = 12
+    options.mapper.abs_pose_min_inlier_ratio = 0.15
+    return dict(pycolmap.incremental_mapping(database, output, output, options))
+
+
+def _incremental_options() -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
     options.random_seed = 0
@@ -116,7 +145,7 @@ def _incremental_mapping(database: Path, output: Path) -> dict[int, Any]:
     mapper.init_max_forward_motion = 1.0
     mapper.filter_min_tri_angle = 0.75
     options.triangulation.min_angle = 0.75
-    return dict(pycolmap.incremental_mapping(database, output, output, options))
+    return options
 
 
 def _read_model(model: Any, problem: Any) -> dict[str, Any]:

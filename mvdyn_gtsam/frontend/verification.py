@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_map import DepthView
-from mvdyn_gtsam.geometry import Similarity, invert_pose, pixel_rays, transform_points
+from mvdyn_gtsam.geometry import Similarity, invert_pose, pixel_rays, project, transform_points
 
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -145,3 +145,48 @@ def _look(
     look = covariance / np.sqrt((variance_own + noise) * (variance_warped + noise))
     enough = (count >= 13) & (variance_own > config.texture**2) & (mask > 0)
     return look.ravel().astype(np.float64), enough.ravel()
+
+
+def verify_seen(
+    views: Sequence[DepthView],
+    wSm: Similarity,
+    image: Float32,
+    intrinsics: Array,
+    targetTw: Array,
+    config: VerificationConfig,
+) -> Verdict:
+    """Warp views of one map into an image ``(H, W)`` without depth (a camera that shows no parallax).
+
+    Only looks can testify: that something floats cannot be seen, so ask for more trust. Points hidden behind
+    nearer ones of the same view say nothing.
+    """
+    agreement = contradiction = 0.0
+    overlapping = 0
+    for view in views:
+        known = np.isfinite(view.depth)
+        rays = pixel_rays(view.grid.pixels, view.intrinsics)
+        points = transform_points(view.mTc, rays * np.where(known, view.depth, 1.0)[:, None])
+        pixels, depth = project(transform_points(targetTw, wSm.transform_points(points)), intrinsics)
+        height, width = image.shape
+        with np.errstate(invalid="ignore"):
+            inside = known & ((pixels >= 0) & (pixels <= [width - 1, height - 1])).all(1)
+        inside &= _nearest(pixels, depth, inside, 2 * view.grid.stride, 1.0 + config.agree)
+        if not inside.any():
+            continue
+        target = DepthView(view.time, np.eye(4), intrinsics, view.grid, view.depth, image)
+        look, textured = _look(view, target, pixels[:, 0], pixels[:, 1], inside, config)
+        overlapping += 1
+        agreement += float((inside & textured & (look > config.same_look)).mean())
+        contradiction += float((inside & textured & (look < config.other_look)).mean())
+    return Verdict(agreement, contradiction, overlapping)
+
+
+def _nearest(
+    pixels: Array, depth: Array, inside: npt.NDArray[np.bool_], cell_px: int, tolerance: float
+) -> npt.NDArray[np.bool_]:
+    """Which points are the foremost, to within a factor, of those that fall into their cell."""
+    cells = np.where(inside[:, None], pixels, 0.0).astype(np.int64) // cell_px
+    index = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
+    front = np.full(index.max() + 1, np.inf)
+    np.minimum.at(front, index[inside], depth[inside])
+    return np.asarray(depth <= tolerance * front[index])
