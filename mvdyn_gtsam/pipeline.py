@@ -67,6 +67,8 @@ def _start(
         return start_from_arrays(writer.read_arrays("start"))
     began = perf_counter()
     start = initializer(capture, progress)
+    for note in start.notes:
+        writer.add_note(note)
     writer.write_arrays("start", start_to_arrays(start))
     writer.finish_stage("start", perf_counter() - began)
     return start

@@ -122,6 +122,10 @@ def _few_views_mapping(database: Path, output: Path) -> dict[int, Any]:
     options = _incremental_options()
     options.min_model_size = 2
     options.triangulation.ignore_two_view_tracks = False
+    # Far apart, they have the angle that video lacks; near-coincident centres are a degenerate start.
+    options.mapper.init_min_tri_angle = 8.0
+    options.mapper.filter_min_tri_angle = 1.5
+    options.triangulation.min_angle = 1.5
     options.mapper.init_min_num_inliers = 20
     options.mapper.abs_pose_min_num_inliers = 12
     options.mapper.abs_pose_min_inlier_ratio = 0.15

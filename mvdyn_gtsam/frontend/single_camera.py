@@ -183,7 +183,8 @@ def _read_map(
     points = solution["points"]
     splits = np.cumsum([len(frame.pixels) for frame in features])[:-1]
     point_of_keypoint = np.split(solution["point_of_keypoint"].astype(np.int64), splits)
-    if len(registered) < 3 or len(points) < 10:
+    # So little is a chance find: most frames of one video follow from each other, and see much in common.
+    if len(registered) < max(3, 0.5 * len(times)) or len(points) < 100:
         return _map_without_depth(camera, times, features)
     mTc = invert_pose(solution["cTw"][registered])
     depth = np.concatenate(

@@ -30,6 +30,8 @@ class Start:
     """Camera indices that share a world frame; every camera is in exactly one group."""
     frames: tuple[tuple[StartFrame, ...], ...]
     """Per camera, in time order, at least one."""
+    notes: tuple[str, ...] = ()
+    """What a reader of the result must know, such as cameras whose place or depth nobody could see."""
 
 
 def start_to_arrays(start: Start) -> dict[str, npt.NDArray[np.float64]]:

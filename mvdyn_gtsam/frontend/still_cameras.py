@@ -24,7 +24,6 @@ from mvdyn_gtsam.errors import ConfigError, TrackingError
 from mvdyn_gtsam.frontend.dense_map import DenseMap
 from mvdyn_gtsam.frontend.features import match_features
 from mvdyn_gtsam.frontend.single_camera import CameraMap
-from mvdyn_gtsam.frontend.start import StartFrame
 from mvdyn_gtsam.frontend.still_view import StillView
 from mvdyn_gtsam.frontend.verification import Verdict, VerificationConfig, verify_seen
 from mvdyn_gtsam.geometry import Similarity, invert_pose, project, transform_points
@@ -46,9 +45,9 @@ class StillConfig:
     map_frames: int = 9
     """Frames of a map matched with a still camera. Source: choice, time."""
     map_ratio: float = 0.9
-    """Lowe's ratio against a map; geometry weeds out. Source: as between maps, experiments/wide_baseline.py."""
-    still_ratio: float = 0.85
-    """Lowe's ratio between still cameras, whose few matches must not drown. Source: panoptic_basketball_6cam."""
+    """Lowe's ratio against a map; geometry weeds out. Source: PlacementConfig.match_ratio."""
+    still_ratio: float = 0.9
+    """Lowe's ratio between still cameras; geometry weeds out. Source: panoptic_basketball_6cam."""
     inlier_px: float = 4.0
     """Reprojection error up to which a match supports a pose. Source: COLMAP filter_max_reproj_error."""
     minimum_inliers: int = 12
@@ -74,7 +73,7 @@ class StillPlacement:
     """What joins the placed maps: still cameras as maps of one frame, to be adjusted with the others."""
 
     groups: tuple[Mapping[int, Similarity], ...]
-    """The groups handed in, with still cameras added, and groups of still cameras alone; not the lone ones."""
+    """The groups handed in, with still cameras added, then a group of still cameras; not the lone ones."""
     maps: Mapping[int, CameraMap] = field(default_factory=dict)
     """Of each placed still camera; one frame, that of its view."""
     same_point: tuple[SamePoint, ...] = ()
@@ -172,7 +171,7 @@ def _place_in_best_group(
 def match_points(
     view: StillView, maps: Sequence[CameraMap], wSm: Sequence[Similarity], config: StillConfig
 ) -> PointsSeen:
-    """Match the view with frames of all maps at all times: it does not move, so they all speak of one pose."""
+    """Match the view with frames of all maps at all times: it stands still, so all speak of one pose."""
     found = [np.zeros((0, 3), np.int64)]
     for camera_map in maps:
         count = len(camera_map.times)
@@ -301,7 +300,9 @@ def solve_still_views(
     return maps, _same_landmarks(views, rows, joined)
 
 
-def _same_landmarks(views: Sequence[StillView], rows: Sequence[Index], joined: Sequence[int]) -> list[SamePoint]:
+def _same_landmarks(
+    views: Sequence[StillView], rows: Sequence[Index], joined: Sequence[int]
+) -> list[SamePoint]:
     same = []
     own = {v: rows[v][rows[v] >= 0] for v in joined}
     for a in joined:
@@ -338,7 +339,9 @@ def _believed(
                 views[v].pinhole.name, total, 100 * shares[v], angles[v],
             )  # fmt: skip
         worst = min(joined, key=lambda v: shares[v])
-        bad = [v for v in joined if counts[v] < config.minimum_inliers or angles[v] < config.minimum_angle_deg]
+        bad = [
+            v for v in joined if counts[v] < config.minimum_inliers or angles[v] < config.minimum_angle_deg
+        ]
         if shares[worst] < config.minimum_explained:
             bad.append(worst)
         if not bad:
@@ -387,10 +390,3 @@ def _solve(views: Sequence[StillView], pairs: Mapping[tuple[int, int], Index]) -
             raise TrackingError(f"structure from motion of the still cameras failed: {reason}")
         with np.load(result) as solution:
             return dict(solution)
-
-
-def lone_frame(camera: Camera, times: npt.NDArray[np.int64]) -> StartFrame:
-    """A frame whose depth nobody knows: 1 on a coarse grid, at the origin, so that tracking has a start."""
-    x, y = np.meshgrid((np.arange(8) + 0.5) / 8 * camera.width, (np.arange(6) + 0.5) / 6 * camera.height)
-    pixels = np.column_stack([x.ravel(), y.ravel()]) - 0.5
-    return StartFrame(int(times[0]), np.eye(4), pixels, np.ones(len(pixels)))

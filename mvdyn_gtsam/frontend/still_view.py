@@ -139,7 +139,7 @@ def relative_rotation(first: Features, second: Features, intrinsics: Array) -> A
 
 
 def virtual_pinhole(camera: Camera, rRc: Array) -> Camera:
-    """The camera r whose image holds those of all rotations, up to ``WIDEST``; integer shift of the centre."""
+    """The camera r whose image holds those of all rotations, up to ``WIDEST``; shifted by whole pixels."""
     corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [camera.width - 1, camera.height - 1]
     rays = np.concatenate([pixel_rays(corners.astype(float), camera.intrinsics) @ R.T for R in rRc])
     pixels, _ = project(rays, camera.intrinsics)
@@ -163,7 +163,7 @@ def frames_of_view(view: StillView, camera: Camera, placed: StartFrame) -> tuple
     """
     points = pixel_rays(placed.pixels, view.pinhole.intrinsics) * placed.depth[:, None]
     frames = []
-    chosen = range(len(view.times)) if view.turns else (0, len(view.times) - 1)
+    chosen = range(len(view.times)) if view.turns else np.unique([0, len(view.times) - 1])
     for row in chosen:
         rTc = np.eye(4)
         rTc[:3, :3] = view.rRc[row]
@@ -172,6 +172,22 @@ def frames_of_view(view: StillView, camera: Camera, placed: StartFrame) -> tuple
             inside = ((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(1)
         frames.append(StartFrame(int(view.times[row]), placed.wTc @ rTc, pixels[inside], depth[inside]))
     return tuple(frames)
+
+
+def lone_frames(camera: Camera, frame_count: int, view: StillView | None) -> tuple[StartFrame, ...]:
+    """Frames at the origin of a camera whose depth nobody knows: 1 on a coarse grid, to be tracked by."""
+    x, y = np.meshgrid((np.arange(8) + 0.5) / 8 * camera.width, (np.arange(6) + 0.5) / 6 * camera.height)
+    pixels = np.column_stack([x.ravel(), y.ravel()]) - 0.5
+    times = np.unique([0, frame_count - 1])
+    wRc = np.tile(np.eye(3), (len(times), 1, 1))
+    if view is not None and view.turns:
+        times, wRc = view.times, view.rRc[0].T @ view.rRc
+    wTc = np.tile(np.eye(4), (len(times), 1, 1))
+    wTc[:, :3, :3] = wRc
+    return tuple(
+        StartFrame(int(time), pose, pixels, np.ones(len(pixels)))
+        for time, pose in zip(times, wTc, strict=True)
+    )
 
 
 def _median(
@@ -185,7 +201,7 @@ def _median(
         low = np.take_along_axis(values, np.maximum((count - 1) // 2, 0)[None], 0)[0]
         high = np.take_along_axis(values, np.maximum(count // 2, 0)[None].clip(max=len(values) - 1), 0)[0]
         image[row] = np.where(count > 0, (low + np.where(high > 255, low, high)) // 2, 0)
-    return image, covered.any(0)
+    return image, np.asarray(covered.any(0))
 
 
 def _unit_rays(pixels: Array, intrinsics: Array) -> Array:

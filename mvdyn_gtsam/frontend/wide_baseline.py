@@ -9,15 +9,15 @@ bundle adjustment has the last word.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.capture.model import Capture
-from mvdyn_gtsam.errors import ConfigError, TrackingError
+from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map
 from mvdyn_gtsam.frontend.features import extract_features
@@ -31,6 +31,8 @@ from mvdyn_gtsam.frontend.placement import (
 )
 from mvdyn_gtsam.frontend.single_camera import CameraMap, build_camera_maps, choose_frames
 from mvdyn_gtsam.frontend.start import Start, StartFrame
+from mvdyn_gtsam.frontend.still_cameras import SamePoint, StillConfig, place_still_cameras
+from mvdyn_gtsam.frontend.still_view import StillView, build_still_view, frames_of_view, lone_frames
 from mvdyn_gtsam.frontend.verification import Verdict, VerificationConfig, verify_placement
 from mvdyn_gtsam.geometry import Similarity
 from mvdyn_gtsam.progress import NullProgress, Progress
@@ -64,6 +66,7 @@ class WideBaselineConfig:
     dense_map: DenseMapConfig = field(default_factory=DenseMapConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     adjustment: AdjustmentConfig = field(default_factory=AdjustmentConfig)
+    still: StillConfig = field(default_factory=StillConfig)
 
     def __post_init__(self) -> None:
         if min(self.maximum_frames, self.neighbours) < 2 or self.features < 100:
@@ -108,29 +111,52 @@ class ClassicalInitializer:
             for camera_map in maps
             if camera_map.has_depth
         }
-        if not dense:
-            names = ", ".join(camera.name for camera in capture.cameras)
-            raise TrackingError(
-                f"{capture.name}: none of {names} moves enough to see depth; let at least one camera move"
-            )
         links, matches = self._links(capture, dense, progress)
-        groups = connect(list(dense), links)
+        views = self._still_views(capture, [m.camera for m in maps if not m.has_depth])
+        placed = place_still_cameras(
+            capture.cameras, dense, connect(list(dense), links), views, config.still, config.verification
+        )
+        # A still camera takes part as the one image that all its frames make up.
+        maps = [placed.maps.get(camera_map.camera, camera_map) for camera_map in maps]
+        cameras = [
+            views[index].pinhole if index in placed.maps else camera
+            for index, camera in enumerate(capture.cameras)
+        ]
         frames: dict[int, tuple[StartFrame, ...]] = {}
-        for group in groups:
-            same_point = [
+        for group in placed.groups:
+            same_point: list[SamePoint] = [
                 (a, b, self._same_points(capture, matches[a, b], a, b, group))
                 for a, b in matches
                 if a in group and b in group
             ]
-            frames |= adjust_maps(capture.cameras, maps, group, same_point, config.adjustment)
-        for camera_map in maps:
-            if camera_map.camera not in dense:
-                groups.append({camera_map.camera: Similarity.identity()})
-                frames[camera_map.camera] = (_lone_frame(camera_map),)
-        return Start(
-            groups=tuple(tuple(sorted(group)) for group in groups),
-            frames=tuple(frames[camera] for camera in range(len(capture.cameras))),
-        )
+            same_point += [pairs for pairs in placed.same_point if pairs[0] in group and pairs[1] in group]
+            frames |= adjust_maps(cameras, maps, group, same_point, config.adjustment)
+        for camera in placed.maps:
+            frames[camera] = frames_of_view(views[camera], capture.cameras[camera], frames[camera][0])
+        groups = [tuple(sorted(group)) for group in placed.groups]
+        start = Start(tuple(groups), tuple(frames.get(camera, ()) for camera in range(len(maps))))
+        return _with_lone_cameras(capture, start, views)
+
+    def _still_views(self, capture: Capture, cameras: Sequence[int]) -> dict[int, StillView]:
+        """The one image that each of these cameras makes up; none for a camera that does more than turn."""
+        views = {}
+        for camera in cameras:
+            times, _ = choose_frames(capture, camera, self.config.frame_step, self.config.still.frames)
+            even = np.linspace(0, capture.frame_count - 1, self.config.still.frames).round()
+            view = build_still_view(
+                capture,
+                camera,
+                np.union1d(times, even.astype(np.int64)),
+                features=self.config.features,
+                contrast=0.5 * self.config.contrast,
+            )
+            name = capture.cameras[camera].name
+            if view is None:
+                logger.info("%s: neither parallax nor a mere turn", name)
+                continue
+            logger.info("%s: %s", name, "only turns" if view.turns else "stands still")
+            views[camera] = view
+        return views
 
     def _same_points(
         self, capture: Capture, matches: PointMatches, a: int, b: int, group: Mapping[int, Similarity]
@@ -198,8 +224,24 @@ class ClassicalInitializer:
         return best
 
 
-def _lone_frame(camera_map: CameraMap) -> StartFrame:
-    return StartFrame(int(camera_map.times[0]), np.eye(4), np.zeros((0, 2)), np.zeros(0))
+def _with_lone_cameras(capture: Capture, start: Start, views: Mapping[int, StillView]) -> Start:
+    """Every camera that nothing places gets a group, and a depth of 1, of its own; notes say so."""
+    lone = [camera for camera, frames in enumerate(start.frames) if not frames]
+    frames, notes = list(start.frames), []
+    for camera in lone:
+        frames[camera] = lone_frames(capture.cameras[camera], capture.frame_count, views.get(camera))
+        motion = "keeps its place" if camera in views else "moves too little or too unclearly for a map"
+        notes.append(
+            f"{capture.cameras[camera].name} {motion} and shares no view with another camera that would show "
+            "its depth: it has a world of its own, in which the depth is made up (1 everywhere)"
+        )
+        logger.warning(notes[-1])
+    return replace(
+        start,
+        groups=(*start.groups, *((camera,) for camera in lone)),
+        frames=tuple(frames),
+        notes=tuple(notes),
+    )
 
 
 def strength(verdict: Verdict) -> float:
