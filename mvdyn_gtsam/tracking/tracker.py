@@ -321,7 +321,7 @@ class Tracker:
             self._time("polish solve", began)
 
     def _take_better_start(self, keyframes: list[Keyframe]) -> None:
-        """Begin the polish, group by group, from what was tracked or from that bent to the start, by the cost.
+        """Begin the polish, from what was tracked or from that bent to the start, whichever costs less.
 
         The window sees only the past and wanders where parallax is low; the start saw the whole video, but
         may be wrong.
