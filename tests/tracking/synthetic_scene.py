@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mvdyn_gtsam.capture.model import Camera
+from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.frontend.start import Start, StartFrame
 
 WIDTH, HEIGHT = 160, 120
@@ -55,12 +55,28 @@ def render(wTc: np.ndarray, view: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True)
+class Frames:
+    """A stream that is already decoded."""
+
+    images: list[np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def read(self, time: int) -> np.ndarray:
+        return self.images[time]
+
+
+@dataclass(frozen=True)
 class Scene:
     cameras: tuple[Camera, ...]
     wTc: np.ndarray
     """``(N, T, 4, 4)``"""
     images: list[list[np.ndarray]]
     depths: list[list[np.ndarray]]
+
+    def capture(self) -> Capture:
+        return Capture("planes", 10.0, self.cameras, tuple(Frames(track) for track in self.images))
 
     def start(
         self,
