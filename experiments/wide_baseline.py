@@ -234,7 +234,8 @@ def render(entries: Sequence[Mapping[str, Any]]) -> str:
     """Summary, pairs and problems as Markdown."""
     columns = ("capture", "start", "groups", "frames", "worst pair deg", "worst pair mm", "% of depth")
     parts = [
-        f"Goal: every pair below {GOAL_DEG} degrees and {100 * GOAL_SHARE:.0f} % of the median true depth.\n",
+        f"Goal: every pair below {GOAL_DEG} degrees and {100 * GOAL_SHARE:.0f} % of the median true depth."
+        f" Commit {', '.join(sorted({str(entry['commit']) for entry in entries}))}.\n",
         table((*columns, "goal met", "s"), summary_rows(entries), text_columns=3),
         "Per pair, RMSE over its frame pairs (worst frame pair in brackets):\n",
         table(

@@ -128,7 +128,13 @@ def test_an_unknown_swept_setting_is_refused() -> None:
 def entry(**changes: Any) -> dict[str, Any]:
     truth = scene(5)
     score = score_start([("cam0", "cam1"), ("cam2",)], truth, truth)
-    content = {"capture": "clip", "variant": "default", "seconds": 12.0, "median_depth_m": 2.0}
+    content = {
+        "capture": "clip",
+        "variant": "default",
+        "seconds": 12.0,
+        "median_depth_m": 2.0,
+        "commit": "abc",
+    }
     return {**content, **asdict(score), **changes}
 
 
