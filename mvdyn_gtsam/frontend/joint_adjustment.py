@@ -296,12 +296,16 @@ def _fix_gauge(
     observations: Observations,
     landmark_key: list[int],
 ) -> None:
-    """Hold one pose, and the scale by the pose farthest from it; a breath of a prior on every point."""
+    """Hold one pose, and the scale by its distance to the farthest; a breath of a prior on every point."""
     anchor = min(wTc)
     graph.add(pose_prior(X(*anchor), wTc[anchor], 1e-5, 1e-5))
     origin = wTc[anchor][:3, 3]
     far = max(wTc, key=lambda label: float(np.linalg.norm(wTc[label][:3, 3] - origin)))
-    graph.add(pose_prior(X(*far), wTc[far], 1e3, 1e-3))
+    # Their distance alone: a held position would keep a badly placed camera where it is.
+    distance = float(np.linalg.norm(wTc[far][:3, 3] - origin))
+    if distance > 0.0:
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-3 * distance)
+        graph.add(gtsam.RangeFactorPose3(X(*anchor), X(*far), distance, noise))
     # Median depth is 1: this only matters for points that hardly anything constrains.
     loose = gtsam.noiseModel.Isotropic.Sigma(3, 10.0)
     for key, point in zip(landmark_key, observations.points, strict=True):
