@@ -143,7 +143,7 @@ def _place_in_best_group(
         seen = match_points(view, [dense[c].sparse for c in group], [group[c] for c in group], config)
         hypotheses = propose_poses(seen, view, config)
         logger.info("%s: %d matches with map points, %d poses", name, len(seen.keypoint), len(hypotheses))
-        for rTw, inliers in hypotheses:
+        for rTw, error in hypotheses:
             verdicts = [
                 verify_seen(dense[c].views, wSm, smooth, view.pinhole.intrinsics, rTw, verification)
                 for c, wSm in group.items()
@@ -153,14 +153,21 @@ def _place_in_best_group(
                 sum(v.contradiction for v in verdicts),
                 sum(v.frame_pairs for v in verdicts),
             )
-            logger.debug("%s: %d inliers, %s, trust %.2f", name, inliers.sum(), verdict, verdict.trust)
+            logger.debug(
+                "%s: %d inliers, %s, trust %.2f",
+                name,
+                (error < config.inlier_px).sum(),
+                verdict,
+                verdict.trust,
+            )
             if verdict.trust < config.minimum_trust:
                 continue
             if verdict.agreement < config.minimum_agreement * verdict.frame_pairs:
                 continue
             strength = verdict.agreement * verdict.trust
             if best is None or strength > best[0]:
-                best = strength, number, rTw, _subset(seen, inliers)
+                # Seen from far aside, errors of the map's depths show: joint adjustment needs room for them.
+                best = strength, number, rTw, _subset(seen, error < 2.0 * config.inlier_px)
     if best is None:
         logger.info("%s: no pose from other cameras' points stands up to dense warping", name)
         return None
@@ -188,10 +195,8 @@ def match_points(
     return PointsSeen(table[:, 0], table[:, 1], table[:, 2], world)
 
 
-def propose_poses(
-    seen: PointsSeen, view: StillView, config: StillConfig
-) -> list[tuple[Array, npt.NDArray[np.bool_]]]:
-    """Poses ``rTw`` and the matches ``(M,)`` that support each; repeatable (fixed seed).
+def propose_poses(seen: PointsSeen, view: StillView, config: StillConfig) -> list[tuple[Array, Array]]:
+    """Poses ``rTw`` and the error in px ``(M,)`` of each match under it; repeatable (fixed seed).
 
     What a pose explains is set aside before the next search: a repeated texture cannot hide the truth.
     """
@@ -219,14 +224,14 @@ def propose_poses(
             rTw = np.eye(4)
             rTw[:3, :3], rTw[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
             where, _ = project(transform_points(rTw, seen.world), intrinsics)
-            error = np.linalg.norm(where - pixels, axis=1)
-            support = np.nan_to_num(error, nan=np.inf) < config.inlier_px
+            error = np.nan_to_num(np.linalg.norm(where - pixels, axis=1), nan=np.inf)
+            support = error < config.inlier_px
             if support.sum() < 6:
                 break
         remaining[rows[inliers.ravel()]] = False
         remaining &= ~support
         if len(np.unique(seen.keypoint[support])) >= config.minimum_inliers:
-            poses.append((rTw, support))
+            poses.append((rTw, error))
     return poses
 
 
