@@ -52,8 +52,8 @@ class StillConfig:
     """Reprojection error up to which a match supports a pose. Source: COLMAP filter_max_reproj_error."""
     minimum_inliers: int = 12
     """Keypoints that must support a pose. Source: choice."""
-    minimum_trust: float = 0.7
-    """Share of favourable testimony; above that of maps, as floating surfaces go unseen. Source: choice."""
+    minimum_trust: float = 0.6
+    """Favourable share of testimony; maps see what floats and need less. Source: true > 0.65, false < 0.45."""
     minimum_agreement: float = 0.03
     """Agreeing share of the image per view of the map. Source: as above."""
     minimum_explained: float = 0.15

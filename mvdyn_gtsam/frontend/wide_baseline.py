@@ -232,8 +232,8 @@ def _with_lone_cameras(capture: Capture, start: Start, views: Mapping[int, Still
         frames[camera] = lone_frames(capture.cameras[camera], capture.frame_count, views.get(camera))
         motion = "keeps its place" if camera in views else "moves too little or too unclearly for a map"
         notes.append(
-            f"{capture.cameras[camera].name} {motion} and shares no view with another camera that would show "
-            "its depth: it has a world of its own, in which the depth is made up (1 everywhere)"
+            f"{capture.cameras[camera].name} {motion} and nothing connects it to cameras that would show its "
+            "depth; it has a world of its own, in which the depth is made up (1 everywhere)"
         )
         logger.warning(notes[-1])
     return replace(
