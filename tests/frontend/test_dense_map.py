@@ -1,0 +1,85 @@
+"""Dense depth from flow within one camera's map, on rendered planes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvdyn_gtsam.errors import ConfigError
+from mvdyn_gtsam.frontend.dense_flow import DisFlow
+from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map
+from mvdyn_gtsam.frontend.features import Features
+from mvdyn_gtsam.frontend.single_camera import CameraMap
+from mvdyn_gtsam.geometry import backproject, invert_pose, project, transform_points
+from tests.tracking.synthetic_scene import HEIGHT, WIDTH, Scene, two_cameras
+
+CONFIG = DenseMapConfig(frames=3, neighbours=8)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return two_cameras(moving=(True,))
+
+
+def exact_map(scene: Scene) -> CameraMap:
+    """True poses, and 200 points of the middle frame wherever they fall in the others."""
+    camera, truth = scene.cameras[0], scene.wTc[0]
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, WIDTH, 200), rng.integers(0, HEIGHT, 200)
+    pixels = np.column_stack([x, y]).astype(float)
+    points = transform_points(truth[4], backproject(pixels, scene.depths[0][4][y, x], camera.intrinsics))
+    features, rows = [], []
+    for wTc in truth:
+        seen, _ = project(transform_points(invert_pose(wTc), points), camera.intrinsics)
+        inside = np.flatnonzero((seen >= 0).all(1) & (seen <= [WIDTH - 1, HEIGHT - 1]).all(1))
+        features.append(Features(seen[inside], np.zeros((len(inside), 128), np.float32)))
+        rows.append(inside)
+    return CameraMap(0, np.arange(9), truth.copy(), tuple(features), tuple(rows), points)
+
+
+@pytest.fixture(scope="module")
+def dense(scene: Scene) -> DenseMap:
+    return densify_map(scene.capture(), exact_map(scene), DisFlow(), CONFIG)
+
+
+def test_views_are_spread_over_the_video(dense: DenseMap, scene: Scene) -> None:
+    assert [view.time for view in dense.views] == [0, 4, 8]
+    for view in dense.views:
+        np.testing.assert_array_equal(view.mTc, scene.wTc[0, view.time])
+        assert view.image.shape == (HEIGHT, WIDTH)
+        assert len(view.depth) == len(view.grid)
+
+
+def test_depth_is_right_where_it_is_given(dense: DenseMap, scene: Scene) -> None:
+    for view in dense.views:
+        truth = view.grid.sample(scene.depths[0][view.time])
+        sure = np.isfinite(view.depth)
+        assert sure.mean() > 0.5
+        error = np.abs(np.log(view.depth[sure] / truth[sure]))
+        assert np.median(error) < 0.02
+        assert np.quantile(error, 0.9) < 0.1
+
+
+def test_a_true_map_is_rigid_and_a_wrong_one_is_not(dense: DenseMap, scene: Scene) -> None:
+    assert dense.rigidity > 0.95
+    true = exact_map(scene)
+    wrong = true.mTc.copy()
+    wrong[:, 1, 3] += 0.15 * np.array([0, 1, 0, -1, 0, 1, 0, -1, 0])  # jumps up and down, which it did not
+    bad = densify_map(scene.capture(), replace(true, mTc=wrong), DisFlow(), CONFIG)
+    assert bad.rigidity < 0.6
+    given = [np.isfinite(view.depth).mean() for view in bad.views]
+    assert np.mean(given) < 0.7 * np.mean([np.isfinite(view.depth).mean() for view in dense.views])
+
+
+def test_without_parallax_no_depth_is_sure() -> None:
+    still = two_cameras(count=9, moving=(False,))
+    view = densify_map(still.capture(), exact_map(still), DisFlow(), CONFIG).views[0]
+    assert np.isnan(view.depth).all()
+
+
+def test_nonsense_is_refused() -> None:
+    for values in ({"frames": 0}, {"stride": 0}, {"depth_sigma": 0.0}):
+        with pytest.raises(ConfigError, match="dense_map"):
+            DenseMapConfig(**values)

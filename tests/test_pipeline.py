@@ -1,0 +1,249 @@
+"""The whole reconstruction: end to end on rendered planes, killed, resumed, run twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from mvdyn_gtsam.capture import load_capture
+from mvdyn_gtsam.capture.model import Capture
+from mvdyn_gtsam.config import Config, load_config
+from mvdyn_gtsam.demo import demo_capture
+from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowPair
+from mvdyn_gtsam.frontend.start import Start
+from mvdyn_gtsam.geometry import invert_pose, rotation_angle_deg
+from mvdyn_gtsam.pipeline import reconstruct
+from mvdyn_gtsam.progress import Progress
+from mvdyn_gtsam.reconstruction import Reconstruction
+from tests.tracking.synthetic_scene import Scene, two_cameras
+
+SMALL = (
+    "tracking.grid_points=300",
+    "tracking.keyframe_px=0.5",
+    "graph.long_range_separation=6",
+    "frontend.wide_baseline.features=1000",
+)
+
+
+def config() -> Config:
+    return load_config(None, SMALL)
+
+
+class GivenStart:
+    """An initializer that hands out a start and counts how often it is asked."""
+
+    def __init__(self, start: Start) -> None:
+        self.start, self.calls = start, 0
+
+    def __call__(self, capture: Capture, progress: Progress) -> Start:
+        self.calls += 1
+        return self.start
+
+
+class StoppedError(Exception):
+    """What ends a run in the middle."""
+
+
+class FlowThatStops(DisFlow):
+    """Measures ``count`` times, then ends the run."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.left = count
+
+    def measure(self, *arguments: Any, **options: Any) -> FlowPair:
+        self.left -= 1
+        if self.left < 0:
+            raise StoppedError
+        return super().measure(*arguments, **options)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return two_cameras(count=6)
+
+
+@pytest.fixture(scope="module")
+def start(scene: Scene) -> GivenStart:
+    return GivenStart(scene.start(((0, 1),), times=(0, 3, 5)))
+
+
+@pytest.fixture(scope="module")
+def result(scene: Scene, start: GivenStart, tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
+    out = tmp_path_factory.mktemp("pipeline") / "out"
+    return reconstruct(scene.capture(), out, config(), initializer=start)
+
+
+def all_poses(result: Reconstruction) -> np.ndarray:
+    return np.stack([result.trajectory(name)[1] for name in result.cameras])
+
+
+def assert_right(result: Reconstruction, scene: Scene, position: float, rotation: float) -> None:
+    """Every frame has a pose and a depth; RMS position and largest rotation error (deg) are within bounds."""
+    wTc = all_poses(result)
+    assert np.isfinite(wTc).all() and wTc.shape == scene.wTc.shape
+    own, true = (invert_pose(poses[0, 0]) @ poses for poses in (wTc, scene.wTc))
+    a, b = own[..., :3, 3], true[..., :3, 3]
+    scale = (a * b).sum() / (a * a).sum()
+    assert np.sqrt(((scale * a - b) ** 2).sum(-1).mean()) < position
+    assert rotation_angle_deg((invert_pose(true) @ own)[..., :3, :3]).max() < rotation
+    for camera, name in enumerate(result.cameras):
+        for number, truth in enumerate(scene.depths[camera]):
+            depth, confidence = result.depth(name, number), result.confidence(name, number)
+            assert depth.shape == confidence.shape == truth.shape
+            ratio = (scale * depth / truth)[confidence > np.median(confidence)]
+            assert np.isfinite(ratio).mean() > 0.9
+            assert np.nanmedian(np.abs(ratio - 1.0)) < 0.05
+
+
+def stages(out: Path) -> dict[str, Mapping[str, Any]]:
+    return {stage["name"]: stage for stage in json.loads((out / "manifest.json").read_text())["stages"]}
+
+
+def test_every_frame_gets_a_pose_and_a_depth(result: Reconstruction, scene: Scene) -> None:
+    assert_right(result, scene, position=0.01, rotation=0.1)
+
+
+def test_the_manifest_tells_what_was_done(result: Reconstruction) -> None:
+    assert list(stages(result.folder)) == ["start", "tracking"]
+    assert result.manifest["status"] == "complete"
+    assert result.manifest["groups"] == [["cam0", "cam1"]]
+    assert result.manifest["unit"] == "arbitrary"
+    assert result.manifest["config"]["tracking"]["grid_points"] == 300
+
+
+def test_diagnostics_are_there(result: Reconstruction) -> None:
+    folder = result.folder / "diagnostics"
+    keyframes = json.loads((folder / "keyframes.json").read_text())
+    assert {name: (times[0], times[-1]) for name, times in keyframes.items()} == {
+        "cam0": (0, 5),
+        "cam1": (0, 5),
+    }
+    edges = json.loads((folder / "edges_per_step.json").read_text())
+    assert {kind: len(counts) for kind, counts in edges.items()} == dict.fromkeys(
+        ("temporal", "spatial", "spatio_temporal"), 6
+    )
+    assert result.arrays("covariance")["covariance"].shape == (2, 6, 6, 6)
+
+
+def test_a_stopped_run_continues_without_a_new_start(
+    result: Reconstruction, scene: Scene, start: GivenStart, tmp_path: Path
+) -> None:
+    again = GivenStart(start.start)
+    with pytest.raises(StoppedError):
+        reconstruct(scene.capture(), tmp_path, config(), initializer=again, flow=FlowThatStops(8))
+    assert list(stages(tmp_path)) == ["start"]
+    assert Reconstruction.load(tmp_path).manifest["status"] == "failed"
+    finished = reconstruct(scene.capture(), tmp_path, config(), initializer=again, resume=True)
+    assert again.calls == 1
+    assert finished.manifest["status"] == "complete"
+    assert list(stages(tmp_path)) == ["start", "tracking"]
+    np.testing.assert_allclose(all_poses(finished), all_poses(result), atol=1e-9, rtol=0)
+
+
+def test_resuming_what_is_finished_computes_nothing(
+    result: Reconstruction, scene: Scene, start: GivenStart
+) -> None:
+    before = (result.folder / "manifest.json").stat().st_mtime_ns, start.calls
+    asked = GivenStart(start.start)
+    again = reconstruct(
+        scene.capture(), result.folder, config(), initializer=asked, flow=FlowThatStops(0), resume=True
+    )
+    assert asked.calls == 0 and start.calls == before[1]
+    np.testing.assert_array_equal(all_poses(again), all_poses(result))
+
+
+def test_cameras_that_nothing_connects_are_said_to_be_apart(tmp_path: Path) -> None:
+    scene = two_cameras(count=4)
+    apart = GivenStart(scene.start(((0,), (1,)), times=(0, 3)))
+    result = reconstruct(scene.capture(), tmp_path / "out", config(), initializer=apart)
+    assert result.groups == [["cam0"], ["cam1"]]
+    assert any("no view connects" in note and "cam0; cam1" in note for note in result.manifest["notes"])
+    assert np.isfinite(all_poses(result)).all()
+
+
+def test_an_unknown_stage_is_refused_before_anything_is_written(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="'polish'"):
+        reconstruct(scene.capture(), tmp_path / "out", stage="polish")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_the_classical_start_leads_to_the_same_quality(tmp_path: Path) -> None:
+    scene = two_cameras()
+    result = reconstruct(scene.capture(), tmp_path / "out", config())
+    assert result.groups == [["cam0", "cam1"]]
+    assert_right(result, scene, position=0.01, rotation=0.1)
+
+
+@pytest.fixture(scope="module")
+def short_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Every third frame of the bundled clip, as images at half its size."""
+    folder = tmp_path_factory.mktemp("short_demo")
+    clip = load_capture(demo_capture())
+    entries = []
+    for index, camera in enumerate(clip.cameras):
+        (folder / camera.name).mkdir()
+        for number, frame in enumerate(range(0, clip.frame_count, 3)):
+            small = cv2.resize(clip.read(index, frame), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            path = folder / camera.name / f"{number:03d}.png"
+            assert cv2.imwrite(str(path), cv2.cvtColor(small, cv2.COLOR_RGB2BGR))
+        centre = {"cx": (camera.cx + 0.5) / 2 - 0.5, "cy": (camera.cy + 0.5) / 2 - 0.5}
+        size = {"width": camera.width // 2, "height": camera.height // 2}
+        focal = {"fx": camera.fx / 2, "fy": camera.fy / 2}
+        source = {"name": camera.name, "source": f"{camera.name}/*.png"}
+        entries.append({**source, **size, **focal, **centre})
+    content = {"name": "short demo", "fps": clip.fps / 3, "cameras": entries}
+    (folder / "capture.json").write_text(json.dumps(content))
+    return folder
+
+
+def mvdyn(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "mvdyn_gtsam", "reconstruct", *(str(one) for one in arguments)]
+
+
+def kill_after_the_start(command: list[str], out: Path) -> None:
+    """Run until the manifest names the start as finished, then kill without warning."""
+    # A group of its own, so that no worker process survives the kill.
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
+    try:
+        while "start" not in (stages(out) if (out / "manifest.json").is_file() else {}):
+            assert process.poll() is None, "the run ended before it could be killed"
+            time.sleep(0.05)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+    assert process.returncode == -signal.SIGKILL
+
+
+@pytest.mark.slow
+def test_a_killed_run_is_resumed_and_runs_repeat_exactly(short_demo: Path, tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run(mvdyn(short_demo, "--out", whole), check=True, capture_output=True)
+    kill_after_the_start(mvdyn(short_demo, "--out", killed), killed)
+    before = stages(killed)
+    assert list(before) == ["start"]
+    assert Reconstruction.load(killed).manifest["status"] == "running"
+    refused = subprocess.run(mvdyn(short_demo, "--out", killed), capture_output=True, text=True)
+    assert refused.returncode == 1 and "--resume" in refused.stderr
+    subprocess.run(mvdyn(short_demo, "--out", killed, "--resume"), check=True, capture_output=True)
+    assert stages(killed)["start"] == before["start"]  # its seconds too: it was not done again
+    first, second = Reconstruction.load(whole), Reconstruction.load(killed)
+    assert second.manifest["status"] == "complete"
+    assert first.groups == second.groups == [["cam0", "cam1"]]
+    assert np.isfinite(all_poses(first)).all()
+    np.testing.assert_allclose(all_poses(second), all_poses(first), atol=1e-9, rtol=0)
+    for name in first.cameras:
+        for number in (0, first.frame_count - 1):
+            np.testing.assert_allclose(second.depth(name, number), first.depth(name, number), rtol=1e-6)
