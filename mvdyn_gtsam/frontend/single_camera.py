@@ -219,7 +219,7 @@ def _map_without_depth(
 
 
 def _median_triangulation_angle_deg(camera_map: CameraMap) -> float:
-    """Median over points of the largest angle between two rays that saw them."""
+    """Median over points of the largest angle between the first ray that saw it and a later one."""
     if not camera_map.has_depth:
         return 0.0
     centres = camera_map.mTc[:, :3, 3]
