@@ -20,6 +20,13 @@ from mvdyn_gtsam.tracking.window import Priors, solve_depth, useful_neighbours
 
 logger = logging.getLogger(__name__)
 
+SHORT_RUN = 3
+"""Levenberg-Marquardt iterations between two searches along the way."""
+LONGEST_SEARCH = 5
+"""Doublings of a search."""
+METIS_FROM = 800
+"""Variables from which nested dissection orders better than COLAMD."""
+
 
 @dataclass(frozen=True)
 class PolishSolve:
@@ -44,25 +51,59 @@ def solve_all(
     """
     frames = {keyframe.frame: keyframe for keyframe in keyframes}
     graph, values = build_graph(keyframes, views, config, priors, thin, robust_px)
-    parameters = gtsam.LevenbergMarquardtParams()
-    # multifrontal Cholesky calls compressed factors indeterminate where sequential solves them
-    parameters.setLinearSolverType("SEQUENTIAL_CHOLESKY")
-    parameters.setOrderingType("METIS" if len(keyframes) > 400 else "COLAMD")
-    parameters.setMaxIterations(config.polish_iterations)
-    parameters.setRelativeErrorTol(config.polish_tolerance)
-    parameters.setAbsoluteErrorTol(0.0)
-    parameters.setlambdaInitial(1e-6)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-    before = optimizer.error()
-    result = optimizer.optimize()
+    before = graph.error(values)
+    result, after, iterations = _minimise(graph, values, before, config)
     for keyframe in keyframes:
         keyframe.wTc = result.atPose3(X(*keyframe.frame)).matrix()
         keyframe.log_scale = result.atDouble(S(*keyframe.frame))
     for keyframe in keyframes:
         solve_depth(keyframe, frames, views, config)
-    solve = PolishSolve(before, optimizer.error(), optimizer.iterations())
+    solve = PolishSolve(before, after, iterations)
     logger.debug("polish: %.1f -> %.1f in %d iterations", *vars(solve).values())
     return solve
+
+
+def _minimise(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, error: float, config: TrackingConfig
+) -> tuple[gtsam.Values, float, int]:
+    """Levenberg-Marquardt in short runs, each followed by a search further along the way it went.
+
+    Re-weighting makes long valleys of a robust cost slow to follow; the search costs no linearisation.
+    """
+    parameters = gtsam.LevenbergMarquardtParams()
+    # multifrontal Cholesky calls compressed factors indeterminate where sequential solves them
+    parameters.setLinearSolverType("SEQUENTIAL_CHOLESKY")
+    parameters.setOrderingType("METIS" if values.size() > METIS_FROM else "COLAMD")
+    parameters.setMaxIterations(SHORT_RUN)
+    parameters.setRelativeErrorTol(config.polish_tolerance)
+    parameters.setAbsoluteErrorTol(0.0)
+    parameters.setlambdaInitial(1e-6)
+    iterations = 0
+    while iterations < config.polish_iterations:
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+        reached = optimizer.optimize()
+        iterations += SHORT_RUN
+        way = values.localCoordinates(reached)
+        reached, reached_error = _search_on(graph, reached, optimizer.error(), way)
+        converged = error - reached_error < config.polish_tolerance * error
+        values, error = reached, reached_error
+        if converged:
+            break
+    return values, error, iterations
+
+
+def _search_on(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, error: float, way: gtsam.VectorValues
+) -> tuple[gtsam.Values, float]:
+    """Go on along ``way`` in doubling steps for as long as the error falls."""
+    for _ in range(LONGEST_SEARCH):
+        candidate = values.retract(way)
+        candidate_error = graph.error(candidate)
+        if not candidate_error < error:
+            break
+        values, error = candidate, candidate_error
+        way = way.add(way)
+    return values, error
 
 
 def total_cost(keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig) -> float:
