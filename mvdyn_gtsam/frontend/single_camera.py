@@ -119,28 +119,35 @@ def build_camera_maps(
         maps = []
         for index, job in enumerate(jobs):
             camera_features = tuple(features[index])
-            if job is None:
-                maps.append(_map_without_depth(index, times[index], camera_features))
-                continue
-            if job.wait() != 0:
-                log = (Path(folder) / f"{index}.log").read_text(errors="replace").strip().splitlines()
-                reason = log[-1] if log else f"exit code {job.returncode}"
-                raise TrackingError(f"structure from motion of {cameras[index].name} failed: {reason}")
-            with np.load(f"{folder}/{index}.out.npz") as solution:
-                built = _read_map(index, times[index], camera_features, dict(solution))
-            angle = _median_triangulation_angle_deg(built)
-            logger.info(
-                "%s alone: %d of %d frames, %d points, %.1f degrees of parallax",
-                cameras[index].name,
-                len(built.times),
-                len(times[index]),
-                len(built.points),
-                angle,
-            )
-            if angle < minimum_angle_deg:
-                built = _map_without_depth(index, times[index], camera_features)
-            maps.append(built)
+            built = None
+            if job is not None:
+                solution = _solution(job, Path(folder), index, cameras[index].name)
+                built = _read_map(index, times[index], camera_features, solution)
+                angle = _median_triangulation_angle_deg(built)
+                logger.info(
+                    "%s alone: %d of %d frames, %d points, %.1f degrees of parallax",
+                    cameras[index].name,
+                    len(built.times),
+                    len(times[index]),
+                    len(built.points),
+                    angle,
+                )
+                if angle < minimum_angle_deg:
+                    built = None
+            maps.append(built or _map_without_depth(index, times[index], camera_features))
     return maps
+
+
+def _solution(
+    job: subprocess.Popen[bytes], folder: Path, index: int, name: str
+) -> dict[str, npt.NDArray[np.float64]]:
+    """What the worker of camera ``index`` found, once it has ended. Raises TrackingError where it failed."""
+    if job.wait() != 0:
+        log = (folder / f"{index}.log").read_text(errors="replace").strip().splitlines()
+        reason = log[-1] if log else f"exit code {job.returncode}"
+        raise TrackingError(f"structure from motion of {name} failed: {reason}")
+    with np.load(folder / f"{index}.out.npz") as solution:
+        return dict(solution)
 
 
 def _match_neighbours(
