@@ -40,8 +40,14 @@ class AdjustmentConfig:
     """Radius of each round of looking for points in frames that should see them. Source: choice."""
     similarity: float = 0.88
     """Cosine of two descriptors from which they may be one point. Source: experiments/wide_baseline.py."""
+    maximum_iterations: int = 25
+    """Levenberg-Marquardt iterations per round. Source: choice, time."""
+    relative_tolerance: float = 1e-3
+    """Relative decrease of the cost at which a round ends. Source: choice, time."""
 
     def __post_init__(self) -> None:
+        if self.maximum_iterations < 1 or self.relative_tolerance <= 0.0:
+            raise ConfigError("frontend.wide_baseline.adjustment: at least 1 iteration, tolerance above 0")
         if self.points_per_camera < 50 or any(radius <= 0.0 for radius in self.search_px):
             raise ConfigError("frontend.wide_baseline.adjustment: points_per_camera >= 50, search_px above 0")
 
@@ -81,10 +87,10 @@ def adjust_maps(
         for camera, similarity in wSm.items()
         for frame, pose in enumerate(similarity.transform_poses(maps[camera].mTc))
     }
-    wTc, observations = _optimise(cameras, wTc, observations)
+    wTc, observations = _optimise(cameras, wTc, observations, config)
     for radius in config.search_px:
         found = _search(cameras, maps, wTc, observations, radius, config.similarity)
-        wTc, observations = _optimise(cameras, wTc, found)
+        wTc, observations = _optimise(cameras, wTc, found, config)
     return {
         camera: tuple(
             _start_frame(camera, frame, maps[camera], wTc[camera, frame], observations)
@@ -230,7 +236,10 @@ def _choose_points(landmark: Index, camera: Index, count: int, per_camera: int) 
 
 
 def _optimise(
-    cameras: Sequence[Camera], wTc: Mapping[tuple[int, int], Array], observations: Observations
+    cameras: Sequence[Camera],
+    wTc: Mapping[tuple[int, int], Array],
+    observations: Observations,
+    config: AdjustmentConfig,
 ) -> tuple[dict[tuple[int, int], Array], Observations]:
     """Bundle adjustment with a redescending loss; sightings that do not fit afterwards are dropped."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -257,8 +266,8 @@ def _optimise(
         )
     _fix_gauge(graph, wTc, observations, landmark_key)
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(25)
-    parameters.setRelativeErrorTol(1e-3)
+    parameters.setMaxIterations(config.maximum_iterations)
+    parameters.setRelativeErrorTol(config.relative_tolerance)
     solution = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
     solved = {label: solution.atPose3(X(*label)).matrix() for label in wTc}
     points = np.array([solution.atPoint3(key) for key in landmark_key]).reshape(-1, 3)

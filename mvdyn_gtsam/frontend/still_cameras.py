@@ -53,7 +53,7 @@ class StillConfig:
     minimum_inliers: int = 12
     """Keypoints that must support a pose. Source: choice."""
     minimum_trust: float = 0.6
-    """Favourable share of testimony; maps see what floats and need less. Source: true > 0.65, false < 0.45."""
+    """Favourable share of testimony; maps see what floats and need less. Source: true > .65, false < .45."""
     minimum_agreement: float = 0.03
     """Agreeing share of the image per view of the map. Source: as above."""
     minimum_explained: float = 0.15
