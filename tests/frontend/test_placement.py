@@ -27,7 +27,7 @@ from tests.frontend.synthetic_maps import CAMERA, Cloud, camera_map, cloud, pose
 
 Array = npt.NDArray[np.float64]
 K = CAMERA.intrinsics
-CONFIG = PlacementConfig(samples=12000)
+CONFIG = PlacementConfig(samples=8000)
 WORLD_A = similarity(1.0, (0.0, 0.1, 0.0), (0.1, 0.0, 0.05))
 WORLD_B = similarity(1.6, (0.2, -0.3, 0.1), (0.4, -0.2, 0.3))
 TRUTH = WORLD_A.compose(WORLD_B.inverse())

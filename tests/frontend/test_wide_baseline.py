@@ -118,7 +118,7 @@ def test_two_cameras_of_one_scene_are_placed() -> None:
 @pytest.mark.slow
 def test_cameras_that_never_share_a_view_stay_apart(shared_data: Path) -> None:
     capture = load_capture(shared_data / "rendered" / "robodog_nonoverlap")
-    config = WideBaselineConfig(maximum_frames=14, features=2000)  # half the defaults, for the time
+    config = WideBaselineConfig(maximum_frames=10, features=1500)  # less than the defaults, for the time
     start = ClassicalInitializer(DisFlow(), config)(capture)
     assert sorted(start.groups) == [(0,), (1,)]
     assert all(len(frames) > 3 for frames in start.frames)
