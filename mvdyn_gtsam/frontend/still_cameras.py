@@ -105,7 +105,7 @@ def place_still_cameras(
     placed: list[dict[int, Similarity]] = [dict(group) for group in groups]
     maps: dict[int, CameraMap] = {}
     same_point: list[SamePoint] = []
-    for camera, view in views.items():
+    for camera, view in views.items() if groups else ():
         found = _place_in_best_group(cameras, dense, groups, view, config, verification)
         if found is None:
             continue
