@@ -51,7 +51,8 @@ class GraphConfig:
     """Inter-camera edges kept in the active window; the oldest go first. Source: paper supplement, edge
     ablation."""
     st_overlap: float = 0.2
-    """Visible share of the grid that a spatio-temporal edge needs. Source: experiments/tracking_sweep.py."""
+    """Visible share of the grid that a spatio-temporal edge needs. Source: choice; cameras of the rendered
+    scenes share 0.25 to 0.44."""
     st_per_frame: int = 1
     """New inter-camera edges per keyframe and other camera, at most. Source: max_active_edges over the
     window."""
@@ -59,12 +60,11 @@ class GraphConfig:
     """Frames between two spatio-temporal edges of one keyframe, at least. Source: choice, half an offset-8
     edge."""
     long_range_per_frame: int = 2
-    """Long-range edges of the polish per keyframe to its own camera. Source:
-    experiments/tracking_sweep.py."""
+    """Long-range edges of the polish per keyframe to its own camera. Source: choice, not swept."""
     long_range_separation: int = 12
     """Keyframes between the ends of a long-range edge, at least. Source: DESIGN 5 (+-16, +-24 worked)."""
     polish_per_frame: int = 2
-    """Edges of the polish per keyframe to each other camera. Source: experiments/tracking_sweep.py."""
+    """Edges of the polish per keyframe to each other camera. Source: choice, not swept."""
     occlusion_tolerance: float = 0.15
     """Relative depth difference up to which two frames are taken to see one surface. Source: choice."""
     max_parallax_deg: float = 60.0
@@ -95,15 +95,15 @@ class TrackingConfig:
     grid_points: int = 768
     """Grid points per frame, about. Source: DESIGN 5."""
     keyframe_px: float = 2.0
-    """Mean flow since the last keyframe that makes a new one, px. Source: experiments/tracking_sweep.py
+    """Mean flow since the last keyframe that makes a new one, px. Source: choice for accuracy, not swept
     (DROID and MegaSAM take 16 to 19 px at full resolution)."""
     guided_px: float = 16.0
     """Mean predicted flow beyond which temporal flow is guided by depth and poses, px. Source:
-    experiments/tracking_sweep.py."""
+    choice, not swept."""
     robust_px: float = 0.2
     """Scale of the Cauchy loss on flow residuals in the polish, px. Source: experiments/tracking_sweep.py."""
     window_robust_px: float = 0.5
-    """The same in the sliding window, whose poses are rougher, px. Source: experiments/tracking_sweep.py."""
+    """The same in the sliding window, whose poses are rougher, px. Source: choice, not swept."""
     noise_px: float = 0.2
     """Standard deviation of flow of weight one, px. Source: measured against the true flow of the rendered
     scenes (median 0.11 to 0.22 px); too large a value lets the depth prior bias the poses."""
@@ -121,17 +121,17 @@ class TrackingConfig:
     start_translation: float = 0.01
     """Standard deviation of the start's positions, in median depths. Source: the start's own goal."""
     step_iterations: int = 2
-    """iSAM2 updates per time step. Source: experiments/tracking_sweep.py."""
+    """iSAM2 updates per time step. Source: choice, not swept."""
     polish_rounds: int = 2
-    """Times the polish measures long-range edges and solves. Source: experiments/tracking_sweep.py."""
+    """Times the polish measures long-range edges and solves. Source: DESIGN 5 (one round); 2 is a choice."""
     polish_iterations: int = 12
     """Levenberg-Marquardt iterations per solve of the polish. Source: experiments/tracking_sweep.py."""
     remeasure_px: float = 0.3
     """Median change of a guided flow's prediction beyond which the polish measures it again, px. Source:
-    experiments/tracking_sweep.py."""
+    choice, not swept."""
     polish_tolerance: float = 1e-6
-    """Relative decrease of the cost at which a solve of the polish ends. Source:
-    experiments/tracking_sweep.py."""
+    """Relative decrease of the cost at which a solve of the polish ends. Source: choice; 1e-4 ended
+    far from the minimum."""
     image_cache_mb: int = 256
     """Memory for frames held or read again. Source: choice, 400 frames of 512x384."""
 

@@ -26,7 +26,7 @@ def extract_features(image: npt.NDArray[np.uint8], maximum: int, contrast: float
     weeded out by geometry later.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    detector = cv2.SIFT.create(maximum, contrastThreshold=contrast)
+    detector = cv2.SIFT.create(maximum, contrastThreshold=contrast, enable_precise_upscale=True)
     keypoints, descriptors = detector.detectAndCompute(grey, None)
     if descriptors is None or len(keypoints) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))

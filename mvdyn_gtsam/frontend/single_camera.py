@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,57 +98,55 @@ def build_camera_maps(
     ``neighbours`` frames ahead are matched. A camera whose median triangulation angle stays below
     ``minimum_angle_deg`` is returned without points.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        jobs: list[subprocess.Popen[bytes] | None] = []
-        running: list[subprocess.Popen[bytes]] = []
-        for index, camera in enumerate(cameras):
-            pairs = _match_neighbours(features[index], neighbours, ratio)
-            if len(times[index]) < 3 or not pairs:
-                jobs.append(None)
-                continue
-            problem = Path(folder) / f"{index}.npz"
-            _write_problem(problem, camera, features[index], pairs)
-            command = [sys.executable, "-m", "mvdyn_gtsam.frontend.sfm_worker", str(problem)]
-            if len(running) >= (os.cpu_count() or 1):
-                running.pop(0).wait()
-            with (Path(folder) / f"{index}.log").open("wb") as log_file:
-                process = subprocess.Popen(
-                    [*command, f"{folder}/{index}.out.npz"], stdout=subprocess.DEVNULL, stderr=log_file
-                )
-            jobs.append(process)
-            running.append(process)
-        maps = []
-        for index, job in enumerate(jobs):
-            camera_features = tuple(features[index])
-            built = None
-            if job is not None:
-                solution = _solution(job, Path(folder), index, cameras[index].name)
-                built = _read_map(index, times[index], camera_features, solution)
-                angle = _median_triangulation_angle_deg(built)
-                logger.info(
-                    "%s alone: %d of %d frames, %d points, %.1f degrees of parallax",
-                    cameras[index].name,
-                    len(built.times),
-                    len(times[index]),
-                    len(built.points),
-                    angle,
-                )
-                if angle < minimum_angle_deg:
-                    built = None
-            maps.append(built or _map_without_depth(index, times[index], camera_features))
+    problems = [
+        (index, _match_neighbours(features[index], neighbours, ratio) if len(times[index]) >= 3 else {})
+        for index in range(len(cameras))
+    ]
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
+        solving = [
+            pool.submit(_solve, cameras[index], features[index], pairs, Path(folder) / str(index))
+            if pairs
+            else None
+            for index, pairs in problems
+        ]
+        solutions = [None if job is None else job.result() for job in solving]
+    maps = []
+    for index, solution in enumerate(solutions):
+        own = tuple(features[index])
+        built = _map_without_depth(index, times[index], own)
+        if solution is not None:
+            found = _read_map(index, times[index], own, solution)
+            angle = _median_triangulation_angle_deg(found)
+            logger.info(
+                "%s alone: %d of %d frames, %d points, %.1f degrees of parallax",
+                cameras[index].name,
+                len(found.times),
+                len(times[index]),
+                len(found.points),
+                angle,
+            )
+            built = found if angle >= minimum_angle_deg else built
+        maps.append(built)
     return maps
 
 
-def _solution(
-    job: subprocess.Popen[bytes], folder: Path, index: int, name: str
+def _solve(
+    camera: Camera,
+    features: Sequence[Features],
+    pairs: dict[tuple[int, int], npt.NDArray[np.int64]],
+    path: Path,
 ) -> dict[str, npt.NDArray[np.float64]]:
-    """What the worker of camera ``index`` found, once it has ended. Raises TrackingError where it failed."""
-    if job.wait() != 0:
-        log = (folder / f"{index}.log").read_text(errors="replace").strip().splitlines()
-        reason = log[-1] if log else f"exit code {job.returncode}"
-        raise TrackingError(f"structure from motion of {name} failed: {reason}")
-    with np.load(folder / f"{index}.out.npz") as solution:
-        return dict(solution)
+    """Structure from motion in a process of its own. Raises TrackingError where it fails."""
+    problem, solution = path.with_suffix(".npz"), path.with_suffix(".out.npz")
+    _write_problem(problem, camera, features, pairs)
+    command = [sys.executable, "-m", "mvdyn_gtsam.frontend.sfm_worker", str(problem), str(solution)]
+    finished = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    if finished.returncode != 0:
+        log = finished.stderr.decode(errors="replace").strip().splitlines()
+        reason = log[-1] if log else f"exit code {finished.returncode}"
+        raise TrackingError(f"structure from motion of {camera.name} failed: {reason}")
+    with np.load(solution) as arrays:
+        return dict(arrays)
 
 
 def _match_neighbours(

@@ -14,7 +14,7 @@ from factors.priors import pose_prior, scale_prior
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.config import Config
 from mvdyn_gtsam.errors import TrackingError
-from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.start import Start
 from mvdyn_gtsam.graph.connections import ConnectionGraph, Edge, EdgeKind, Frame
 from mvdyn_gtsam.tracking.connect import inter_camera_edges
@@ -40,8 +40,7 @@ class TrackState:
         self.start, self.units = normalised_start(start)
         self.views = tuple(View.of(camera, config.tracking.grid_points) for camera in cameras)
         self.images = ImageStore(config.tracking.image_cache_mb * 2**20, read)
-        flow_config = getattr(config.frontend, "flow", None) or FlowConfig()
-        self.measurer = EdgeMeasurer(self.views, flow, flow_config, self.images, config.tracking)
+        self.measurer = EdgeMeasurer(self.views, flow, config.frontend.flow, self.images, config.tracking)
         self.graph = ConnectionGraph(config.graph.max_active_edges)
         self.tracks: list[list[Keyframe]] = [[] for _ in cameras]
         """Per camera its keyframes."""
