@@ -95,14 +95,19 @@ def _track(
     began = perf_counter()
     tracker = Tracker(capture.cameras, start, flow, config, read=capture.read)
     cameras = range(len(capture.cameras))
-    for time in range(capture.frame_count):
-        report = tracker.step(time, [capture.read(camera, time) for camera in cameras])
-        progress.update("tracking", time + 1, capture.frame_count, f"{sum(report.keyframes)} new keyframes")
-    progress.update("polish", 0, 1, "all keyframes together")
-    result = tracker.finish()
-    progress.update("polish", 1, 1)
-    for camera in cameras:
-        writer.write_trajectory(capture.cameras[camera].name, capture.timestamps, result.wTc[camera])
+    wTc = np.full((len(capture.cameras), capture.frame_count, 4, 4), np.nan)
+    try:
+        for time in range(capture.frame_count):
+            report = tracker.step(time, [capture.read(camera, time) for camera in cameras])
+            wTc[:, time] = report.wTc
+            note = f"{sum(report.keyframes)} new keyframes"
+            progress.update("tracking", time + 1, capture.frame_count, note)
+        result = tracker.finish(lambda done, total: progress.update("polish", done, total, "long-range flow"))
+        wTc = result.wTc
+    finally:
+        # Also when stopped half-way: what is known by then can be read and looked at.
+        for camera in cameras:
+            writer.write_trajectory(capture.cameras[camera].name, capture.timestamps, wTc[camera])
     _write_diagnostics(capture, result, writer)
     total = capture.frame_count * len(capture.cameras)
     for done, depth in enumerate(tracker.frame_depths()):

@@ -144,7 +144,11 @@ def test_a_stopped_run_continues_without_a_new_start(
     with pytest.raises(StoppedError):
         reconstruct(scene.capture(), tmp_path, config(), initializer=again, flow=FlowThatStops(8))
     assert list(stages(tmp_path)) == ["start"]
-    assert Reconstruction.load(tmp_path).manifest["status"] == "failed"
+    stopped = Reconstruction.load(tmp_path)
+    assert stopped.manifest["status"] == "failed"
+    # what was tracked by then can be read, and what was not is no pose
+    known = np.isfinite(stopped.trajectory(stopped.cameras[0])[1][:, 0, 0])
+    assert known[0] and not known[-1]
     finished = reconstruct(scene.capture(), tmp_path, config(), initializer=again, resume=True)
     assert again.calls == 1
     assert finished.manifest["status"] == "complete"
