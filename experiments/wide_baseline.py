@@ -19,7 +19,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,9 @@ from mvdyn_gtsam.capture.model import Capture, FrameStream
 from mvdyn_gtsam.config import Config, load_config, to_dict
 from mvdyn_gtsam.errors import BaselineError, MvdynError
 
+if TYPE_CHECKING:
+    from mvdyn_gtsam.frontend.start import Start
+
 Placed = tuple[list[list[str]], Mapping[str, Frames], float]
 """Groups of cameras, their placed frames, and the seconds it took."""
 
@@ -57,7 +60,24 @@ def run_classical(capture: Capture, config: Config) -> Placed:
 
     began = time.perf_counter()
     start = ClassicalInitializer(DisFlow(config.frontend.flow), config.frontend.wide_baseline)(capture)
-    seconds = time.perf_counter() - began
+    return _placed(capture, start, time.perf_counter() - began)
+
+
+def read_kept(capture: Capture, work: Path) -> Placed:
+    """The start that experiments.accuracy left in ``work``. Raises TrackingError where it has none."""
+    from mvdyn_gtsam.errors import TrackingError
+    from mvdyn_gtsam.frontend.start import start_from_arrays
+    from mvdyn_gtsam.reconstruction import Reconstruction
+
+    folder = work / capture.name / "ours" / "ours"
+    result = Reconstruction.load(folder)
+    seconds = {stage["name"]: stage["seconds"] for stage in result.manifest["stages"]}
+    if "start" not in seconds:
+        raise TrackingError(f"{folder}: holds no finished start")
+    return _placed(capture, start_from_arrays(result.arrays("start")), seconds["start"])
+
+
+def _placed(capture: Capture, start: Start, seconds: float) -> Placed:
     names = [camera.name for camera in capture.cameras]
     frames: dict[str, Frames] = {
         name: {frame.time: frame.wTc for frame in own} for name, own in zip(names, start.frames, strict=True)
@@ -137,8 +157,11 @@ def variants(overrides: Sequence[str], sweeps: Sequence[str], joint_frames: int)
     return result
 
 
-def measure(folder: Path, variant: Variant) -> dict[str, Any]:
-    """One run as an entry of the records. A start that fails is an entry that says so."""
+def measure(folder: Path, variant: Variant, work: Path | None = None) -> dict[str, Any]:
+    """One run, or the start kept in ``work``, as an entry of the records.
+
+    A start that fails is an entry that says so.
+    """
     from mvdyn_gtsam.capture import load_capture
     from mvdyn_gtsam.errors import TrackingError
     from mvdyn_gtsam.evaluation import load_groundtruth
@@ -150,6 +173,8 @@ def measure(folder: Path, variant: Variant) -> dict[str, Any]:
     try:
         if variant.joint_frames:
             groups, frames, seconds = run_joint_sfm(capture, variant.joint_frames)
+        elif work is not None:
+            groups, frames, seconds = read_kept(capture, work)
         else:
             groups, frames, seconds = run_classical(capture, variant.config)
         score = score_start(groups, frames, truth)
@@ -258,6 +283,8 @@ def parser() -> argparse.ArgumentParser:
                         help="change a setting, e.g. frontend.wide_baseline.ratio=0.7")  # fmt: skip
     result.add_argument("--sweep", dest="sweeps", action="append", default=[], metavar="KEY=V1,V2,...",
                         help="repeat with each value; several sweeps: one at a time")  # fmt: skip
+    result.add_argument("--kept", type=Path, metavar="WORK",
+                        help="read the starts that experiments.accuracy left here")  # fmt: skip
     result.add_argument("--joint-sfm", action="store_true", help="also start from joint SfM by COLMAP")
     result.add_argument("--joint-frames", type=int, default=8, metavar="N",
                         help="frames per camera for --joint-sfm (default: %(default)s)")  # fmt: skip
@@ -282,7 +309,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             entry = None if options.again else records.find(key)
             if entry is None:
                 sys.stderr.write(f"{folder.name}, {variant.name}: running\n")
-                entry = records.add(key, measure(folder, variant))
+                entry = records.add(key, measure(folder, variant, options.kept))
             else:
                 sys.stderr.write(f"{folder.name}, {variant.name}: kept from commit {entry['commit']}\n")
             # A value of a sweep that equals the default was measured under that name.

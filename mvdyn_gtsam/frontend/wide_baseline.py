@@ -9,7 +9,7 @@ bundle adjustment has the last word.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -94,6 +94,10 @@ class Placement:
     verdict: Verdict
 
 
+Judge = Callable[[int, int, Similarity], float]
+"""What speaks for a placement ``aSb`` of two cameras' maps, less what speaks against it."""
+
+
 class ClassicalInitializer:
     """The default start: structure from motion per camera, pooled matches, dense verification."""
 
@@ -114,7 +118,12 @@ class ClassicalInitializer:
         links, matches = self._links(capture, dense, progress)
         views = self._still_views(capture, [m.camera for m in maps if not m.has_depth])
         placed = place_still_cameras(
-            capture.cameras, dense, connect(list(dense), links), views, config.still, config.verification
+            capture.cameras,
+            dense,
+            connect(list(dense), links, self._judge(dense)),
+            views,
+            config.still,
+            config.verification,
         )
         # A still camera takes part as the one image that all its frames make up.
         maps = [placed.maps.get(camera_map.camera, camera_map) for camera_map in maps]
@@ -194,38 +203,43 @@ class ClassicalInitializer:
     def _links(
         self, capture: Capture, dense: Mapping[int, DenseMap], progress: Progress
     ) -> tuple[list[Placement], dict[tuple[int, int], PointMatches]]:
-        """The best verified placement of every pair of cameras that has one."""
+        """Every believable placement of every pair of cameras, and the matches they come from."""
         pairs = [(a, b) for a in dense for b in dense if a < b]
         links, matches = [], {}
         for number, (a, b) in enumerate(pairs):
             progress.update("start", len(pairs) + number, 2 * len(pairs), "placing cameras")
             matches[a, b] = match_maps(dense[a].sparse, dense[b].sparse, self.config.placement)
-            link = self._place(capture, dense[a], dense[b], matches[a, b])
+            found = self._place(capture, dense[a], dense[b], matches[a, b])
             names = f"{capture.cameras[a].name} - {capture.cameras[b].name}"
-            if link is None:
+            if not found:
                 logger.info("%s: no placement stands up to dense warping", names)
                 continue
-            logger.info("%s: placed, %.0f %% of the testimony in favour", names, 100.0 * link.verdict.trust)
-            links.append(link)
+            trust = 100.0 * max(link.verdict.trust for link in found)
+            logger.info("%s: %d placements believable, at best %.0f %% in favour", names, len(found), trust)
+            links += found
         return links, matches
 
     def _place(
         self, capture: Capture, first: DenseMap, second: DenseMap, matches: PointMatches
-    ) -> Placement | None:
+    ) -> list[Placement]:
+        """Every hypothesis that dense warping does not refute; repeated structure may leave several."""
         config = self.config
         a, b = first.sparse.camera, second.sparse.camera
-        best: Placement | None = None
+        found = []
         for hypothesis in propose_placements(
             matches, capture.cameras[a].intrinsics, capture.cameras[b].intrinsics, config.placement
         ):
             verdict = verify_placement(first.views, second.views, hypothesis.aSb, config.verification)
-            if verdict.trust < config.minimum_trust:
-                continue
-            if verdict.agreement < config.minimum_agreement * verdict.frame_pairs:
-                continue
-            if best is None or strength(verdict) > strength(best.verdict):
-                best = Placement(a, b, hypothesis.aSb, verdict)
-        return best
+            enough = verdict.agreement >= config.minimum_agreement * verdict.frame_pairs
+            if verdict.trust >= config.minimum_trust and enough:
+                found.append(Placement(a, b, hypothesis.aSb, verdict))
+        return found
+
+    def _judge(self, dense: Mapping[int, DenseMap]) -> Judge:
+        def judge(a: int, b: int, aSb: Similarity) -> float:
+            return balance(verify_placement(dense[a].views, dense[b].views, aSb, self.config.verification))
+
+        return judge
 
 
 def _with_lone_cameras(capture: Capture, start: Start, views: Mapping[int, StillView]) -> Start:
@@ -248,33 +262,66 @@ def _with_lone_cameras(capture: Capture, start: Start, views: Mapping[int, Still
     )
 
 
-def strength(verdict: Verdict) -> float:
-    """How much is agreed on, discounted by how much is disputed."""
-    return verdict.agreement * verdict.trust
+def balance(verdict: Verdict) -> float:
+    """What speaks for a placement less what speaks against it."""
+    return verdict.agreement - verdict.contradiction
 
 
-def connect(cameras: list[int], links: list[Placement]) -> list[dict[int, Similarity]]:
+def connect(
+    cameras: list[int], links: list[Placement], judge: Judge | None = None
+) -> list[dict[int, Similarity]]:
     """Groups of connected cameras, each camera's map placed in its group's world (``wSm``).
 
-    The strongest links are taken first (a maximum spanning forest); the world of a group is the map of its
-    lowest-numbered camera.
+    Groups grow by one link at a time, the one with most in its favour first. With ``judge``, which says
+    what speaks for a placement of any two cameras, a link counts for what it implies for *every* pair of
+    cameras it brings together: a shift along a repeated texture can satisfy one pair, hardly all. A link
+    with more against it than for it joins nothing. The world of a group is the map of its lowest-numbered
+    camera.
     """
     group_of = {camera: {camera: Similarity.identity()} for camera in cameras}
-    for link in sorted(links, key=lambda link: -strength(link.verdict)):
-        first, second = group_of[link.first], group_of[link.second]
-        if first is second:
-            continue
-        # first world <- map a <- map b <- second world
-        bridge = first[link.first].compose(link.aSb).compose(second[link.second].inverse())
+    known: dict[int, float] = {}
+    while True:
+        open_links = [
+            index for index, link in enumerate(links) if group_of[link.first] is not group_of[link.second]
+        ]
+        for index in open_links:
+            if index not in known:
+                known[index] = _value(links[index], group_of, judge)
+        if not open_links or known[best := max(open_links, key=lambda index: known[index])] <= 0.0:
+            break
+        first, second = group_of[links[best].first], group_of[links[best].second]
+        bridge = _bridge(links[best], group_of)
         for camera, similarity in second.items():
             first[camera] = bridge.compose(similarity)
             group_of[camera] = first
+        # What a link into this group brings together has changed.
+        known = {
+            index: value
+            for index, value in known.items()
+            if group_of[links[index].first] is not first and group_of[links[index].second] is not first
+        }
     groups: list[dict[int, Similarity]] = []
     for camera in cameras:
         group = group_of[camera]
-        if not any(group is known for known in groups):
+        if not any(group is other for other in groups):
             groups.append(group)
     return [
         {camera: group[min(group)].inverse().compose(group[camera]) for camera in sorted(group)}
         for group in groups
     ]
+
+
+def _bridge(link: Placement, group_of: Mapping[int, Mapping[int, Similarity]]) -> Similarity:
+    """World of the first camera's group from the world of the second's."""
+    first, second = group_of[link.first], group_of[link.second]
+    return first[link.first].compose(link.aSb).compose(second[link.second].inverse())
+
+
+def _value(link: Placement, group_of: Mapping[int, Mapping[int, Similarity]], judge: Judge | None) -> float:
+    if judge is None:
+        return balance(link.verdict)
+    bridge = _bridge(link, group_of)
+    first, second = group_of[link.first], group_of[link.second]
+    return sum(
+        judge(a, b, first[a].inverse().compose(bridge).compose(second[b])) for a in first for b in second
+    )

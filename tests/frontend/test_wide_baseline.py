@@ -16,8 +16,8 @@ from mvdyn_gtsam.frontend.wide_baseline import (
     ClassicalInitializer,
     Placement,
     WideBaselineConfig,
+    balance,
     connect,
-    strength,
 )
 from mvdyn_gtsam.geometry import Similarity, rotation_angle_deg
 from tests.frontend.synthetic_maps import similarity
@@ -73,10 +73,33 @@ def test_a_weak_link_that_contradicts_strong_ones_loses() -> None:
         assert_true(group)
 
 
-def test_strength_discounts_what_is_disputed() -> None:
-    assert strength(Verdict(2.0, 0.0, 4)) == 2.0
-    assert strength(Verdict(3.0, 3.0, 4)) == 1.5
-    assert strength(Verdict(0.0, 0.0, 0)) == 0.0
+def test_a_repeated_texture_that_satisfies_one_pair_loses_against_what_all_pairs_say() -> None:
+    wrong = similarity(1.0, (0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
+    links = [link(0, 1), link(1, 2, WEAK), link(0, 2, STRONG, wrong)]
+    favour = {(0, 1): 2.0, (1, 2): 0.5, (0, 2): 1.0}
+
+    def judge(a: int, b: int, aSb: Similarity) -> float:
+        a, b, aSb = (a, b, aSb) if a < b else (b, a, aSb.inverse())
+        true = WORLD[a].compose(WORLD[b].inverse())
+        if np.allclose(aSb.matrix(), true.matrix(), atol=1e-9):
+            return favour[a, b]
+        return 1.2 if (a, b) == (0, 2) else -3.0  # the shifted texture suits 0 and 2 better than the truth
+
+    (group,) = connect([0, 1, 2], links, judge)
+    assert_true(group)
+    # Without the third camera's word it wins.
+    (misled,) = connect([0, 2], [link(0, 2, WEAK), links[2]], judge)
+    assert not np.allclose(misled[2].matrix(), group[2].matrix())
+
+
+def test_a_link_with_more_against_it_than_for_it_joins_nothing() -> None:
+    groups = connect([0, 1], [link(0, 1)], lambda a, b, aSb: -0.1)
+    assert [sorted(group) for group in groups] == [[0], [1]]
+
+
+def test_balance_weighs_both_sides() -> None:
+    assert balance(Verdict(2.0, 0.5, 4)) == 1.5
+    assert balance(Verdict(1.0, 3.0, 4)) == -2.0
 
 
 def test_nonsense_is_refused() -> None:
