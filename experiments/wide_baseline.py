@@ -56,10 +56,12 @@ GOAL_SHARE = 0.03
 def run_classical(capture: Capture, config: Config) -> Placed:
     """Groups, placed frames and seconds of the classical start."""
     from mvdyn_gtsam.frontend.dense_flow import DisFlow
+    from mvdyn_gtsam.frontend.dense_map import testimony_flow
     from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer
 
     began = time.perf_counter()
-    start = ClassicalInitializer(DisFlow(config.frontend.flow), config.frontend.wide_baseline)(capture)
+    flow = DisFlow(testimony_flow(config.frontend.flow))
+    start = ClassicalInitializer(flow, config.frontend.wide_baseline)(capture)
     return _placed(capture, start, time.perf_counter() - began)
 
 

@@ -12,6 +12,7 @@ from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import Config, to_dict
 from mvdyn_gtsam.frontend.dense_depth import upsample_depth
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, DisFlow
+from mvdyn_gtsam.frontend.dense_map import testimony_flow
 from mvdyn_gtsam.frontend.start import Start, start_from_arrays, start_to_arrays
 from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer, WideBaselineInitializer
 from mvdyn_gtsam.progress import NullProgress, Progress
@@ -45,7 +46,8 @@ def reconstruct(
     progress = progress if progress is not None else NullProgress()
     flow = flow if flow is not None else DisFlow(config.frontend.flow)
     if initializer is None:
-        initializer = ClassicalInitializer(flow, config.frontend.wide_baseline)
+        testimony = DisFlow(testimony_flow(config.frontend.flow))
+        initializer = ClassicalInitializer(testimony, config.frontend.wide_baseline)
     out = Path(out)
     writer = ReconstructionWriter.create(
         out, CaptureInfo.from_capture(capture), to_dict(config), resume=resume

@@ -7,7 +7,7 @@ tells a good map from a bad one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ from factors.structureless import (
 from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_depth import interpolate_sparse_depth
-from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowPair, GridFlow, sample_pair
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, FlowPair, GridFlow, sample_pair
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.frontend.guided_flow import predicted_flow
 from mvdyn_gtsam.frontend.single_camera import CameraMap
@@ -79,6 +79,15 @@ class DenseMap:
     """Frames spread over the video."""
     rigidity: float
     """Share of the measured flow that a rigid scene explains to 1.5 px: what the map is worth."""
+
+
+def testimony_flow(config: FlowConfig) -> FlowConfig:
+    """Flow settings for depth that testifies about placements: the finest, and smooth.
+
+    There is little of it, and completeness decides: on a wall of repeated posters (multicamvideo) the truth
+    leads a shifted placement by 7.9 to 5.1 with it, and by 5.2 to 4.6 without the smoothing.
+    """
+    return replace(config, finest_scale=0, variational_iterations=5)
 
 
 Flows = dict[int, GridFlow]

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from mvdyn_gtsam.errors import ConfigError
-from mvdyn_gtsam.frontend.dense_flow import DisFlow
+from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
 from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map
 from mvdyn_gtsam.frontend.features import Features
 from mvdyn_gtsam.frontend.single_camera import CameraMap
 from mvdyn_gtsam.geometry import backproject, invert_pose, project, transform_points
 from tests.tracking.synthetic_scene import HEIGHT, WIDTH, Scene, two_cameras
 
+FULL = FlowConfig(finest_scale=0)
 CONFIG = DenseMapConfig(frames=3, neighbours=8)
 
 
@@ -41,7 +42,7 @@ def exact_map(scene: Scene) -> CameraMap:
 
 @pytest.fixture(scope="module")
 def dense(scene: Scene) -> DenseMap:
-    return densify_map(scene.capture(), exact_map(scene), DisFlow(), CONFIG)
+    return densify_map(scene.capture(), exact_map(scene), DisFlow(FULL), CONFIG)
 
 
 def test_views_are_spread_over_the_video(dense: DenseMap, scene: Scene) -> None:
@@ -67,7 +68,7 @@ def test_a_true_map_is_rigid_and_a_wrong_one_is_not(dense: DenseMap, scene: Scen
     true = exact_map(scene)
     wrong = true.mTc.copy()
     wrong[:, 1, 3] += 0.15 * np.array([0, 1, 0, -1, 0, 1, 0, -1, 0])  # jumps up and down, which it did not
-    bad = densify_map(scene.capture(), replace(true, mTc=wrong), DisFlow(), CONFIG)
+    bad = densify_map(scene.capture(), replace(true, mTc=wrong), DisFlow(FULL), CONFIG)
     assert bad.rigidity < 0.6
     given = [np.isfinite(view.depth).mean() for view in bad.views]
     assert np.mean(given) < 0.7 * np.mean([np.isfinite(view.depth).mean() for view in dense.views])
@@ -75,7 +76,7 @@ def test_a_true_map_is_rigid_and_a_wrong_one_is_not(dense: DenseMap, scene: Scen
 
 def test_without_parallax_no_depth_is_sure() -> None:
     still = two_cameras(count=9, moving=(False,))
-    view = densify_map(still.capture(), exact_map(still), DisFlow(), CONFIG).views[0]
+    view = densify_map(still.capture(), exact_map(still), DisFlow(FULL), CONFIG).views[0]
     assert np.isnan(view.depth).all()
 
 
