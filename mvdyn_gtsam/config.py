@@ -118,7 +118,8 @@ class TrackingConfig:
     """Standard deviation of a keyframe's log depth scale. Source: choice."""
     start_rotation_deg: float = 0.02
     """Standard deviation of the start's rotations. Source: what the start reaches on the rendered scenes
-    (experiments/wide_baseline.py); single runs gave dynamic_human 9.7 mm with 0.5, 5.4 with 0.05, 2.6 with 0.02."""
+    (experiments/wide_baseline.py); single runs gave dynamic_human 9.7 mm with 0.5, 5.4 with 0.05 and 2.6
+    with 0.02."""
     start_translation: float = 0.0005
     """Standard deviation of the start's positions, in median depths. Source: as above."""
     step_iterations: int = 2
