@@ -114,14 +114,18 @@ def _remeasure(state: TrackState, on_progress: OnProgress | None) -> None:
     # in time order, so that frames that must be decoded again are read nearly in order
     by_time = [sorted(frames, key=_time_first, reverse=True) for frames in state.kinds]
     ordered = sorted(by_time, key=lambda pair: [_time_first(frame) for frame in pair])
-    for done, (i, j) in enumerate(ordered):
-        if on_progress is not None:
-            on_progress(done, len(ordered))
-        first, second = state.frames[i], state.frames[j]
-        if j in first.flows and (j not in first.guides or not state.measurer.outdated(first, second)):
-            continue
-        if state.images.available(i) and state.images.available(j):
-            state.measurer.guided(first, second)
+
+    def due() -> Iterator[tuple[Keyframe, Keyframe]]:
+        for done, (i, j) in enumerate(ordered):
+            if on_progress is not None:
+                on_progress(done, len(ordered))
+            first, second = state.frames[i], state.frames[j]
+            if j in first.flows and (j not in first.guides or not state.measurer.outdated(first, second)):
+                continue
+            if state.images.available(i) and state.images.available(j):
+                yield first, second
+
+    state.measurer.guided_all(due())
 
 
 def _time_first(frame: Frame) -> tuple[int, int]:
@@ -172,8 +176,7 @@ def _settle(state: TrackState, frame: Keyframe) -> PoseFit:
     """Final pose of a frame that is no keyframe, from the keyframes on both sides of it."""
     sources = _around(state, frame)
     if all(state.images.available(k.frame) for k in (frame, *sources)):
-        for source in sources:
-            state.measurer.temporal(source, frame)
+        state.measurer.temporal_all([(source, frame) for source in sources])
     usable = [source for source in sources if frame.frame in source.flows]
     last = usable[0]
     times = [source.time for source in sources]

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from mvdyn_gtsam.frontend.dense_flow import to_grey
 from mvdyn_gtsam.graph.connections import Frame
 
 Image = npt.NDArray[np.uint8]
@@ -15,10 +16,13 @@ Read = Callable[[int, int], Image]
 
 
 class ImageStore:
-    """Images by frame, the ones used least recently dropped beyond ``capacity_bytes``."""
+    """Images by frame, the ones used least recently dropped beyond ``capacity_bytes``.
 
-    def __init__(self, capacity_bytes: int, read: Read | None = None) -> None:
-        self._capacity = capacity_bytes
+    With ``grey`` only their luminance ``(H, W)`` is kept and handed out.
+    """
+
+    def __init__(self, capacity_bytes: int, read: Read | None = None, grey: bool = False) -> None:
+        self._capacity, self._grey = capacity_bytes, grey
         self.read = read
         self._images: OrderedDict[Frame, Image] = OrderedDict()
         self._bytes = 0
@@ -27,6 +31,8 @@ class ImageStore:
         if frame in self._images:
             self._images.move_to_end(frame)
             return
+        if self._grey:
+            image = to_grey(image)
         self._images[frame] = image
         self._bytes += image.nbytes
         while self._bytes > self._capacity and len(self._images) > 1:
@@ -48,8 +54,7 @@ class ImageStore:
         if image is None:
             if self.read is None:
                 raise KeyError(f"frame {frame} is no longer held and there is nothing to read it from")
-            image = self.read(*frame)
-            self.put(frame, image)
+            self.put(frame, self.read(*frame))
         else:
             self._images.move_to_end(frame)
-        return image
+        return self._images[frame]

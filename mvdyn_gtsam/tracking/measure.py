@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+import os
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from factors.projection import reproject
 from mvdyn_gtsam.config import TrackingConfig
-from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, FlowPair, sample_pair
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, GridFlow, sample_pair
+from mvdyn_gtsam.frontend.grid import Grid
+from mvdyn_gtsam.frontend.grid_flow import GridView, OneWayFlow, guide_grid, measure_grid
 from mvdyn_gtsam.frontend.guided_flow import guided_flow
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
@@ -18,10 +25,26 @@ from mvdyn_gtsam.tracking.images import ImageStore
 from mvdyn_gtsam.tracking.model import Guide, Keyframe, View
 
 Array = npt.NDArray[np.float64]
+GridFlows = tuple[GridFlow, GridFlow]
+"""i -> j at the grid of i, and j -> i at that of j."""
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One connection to measure; ``run`` touches nothing that is shared."""
+
+    i: Keyframe
+    j: Keyframe
+    guides: tuple[Guide, Guide] | None
+    run: Callable[[], GridFlows]
 
 
 class EdgeMeasurer:
-    """Measures connections between frames whose images the store can deliver."""
+    """Measures connections between frames whose images the store can deliver.
+
+    A flow that can measure one direction alone (``OneWayFlow``) is evaluated at the grid, for several
+    connections side by side; any other ``DenseFlow`` is asked for whole images, one connection at a time.
+    """
 
     def __init__(
         self,
@@ -33,37 +56,72 @@ class EdgeMeasurer:
     ) -> None:
         self._views, self._flow, self._flow_config = views, flow, flow_config
         self._images, self._config = images, config
-        self._dense: OrderedDict[int, tuple[Array, npt.NDArray[np.float32]]] = OrderedDict()
+        self._smooth: OrderedDict[int, tuple[Array, Array]] = OrderedDict()
+        self._workers = (os.cpu_count() or 1) if isinstance(flow, OneWayFlow) else 1
+        self._pool = ThreadPoolExecutor(self._workers) if self._workers > 1 else None
 
     def temporal(self, i: Keyframe, j: Keyframe) -> None:
         """Measure two frames of one camera: guided where the prediction says that the flow is long."""
-        if self.predicted_length(i, j) > self._config.guided_px:
-            self.guided(i, j)
-            return
-        image_i, image_j = self._images.get(i.frame), self._images.get(j.frame)
-        pair = self._flow.measure(image_i, image_j)
-        self._store(i, j, pair)
-        for a, b in ((i, j), (j, i)):
-            a.guides.pop(b.frame, None)
+        self.temporal_all([(i, j)])
 
     def guided(self, i: Keyframe, j: Keyframe) -> None:
         """Measure any two frames around what their depths and poses predict."""
-        view_i, view_j = self._views[i.camera], self._views[j.camera]
-        jTi = invert_pose(j.wTc) @ i.wTc
-        pair = guided_flow(
-            self._flow,
-            self._images.get(i.frame),
-            self._images.get(j.frame),
-            self._dense_depth(i),
-            self._dense_depth(j),
-            view_i.camera.intrinsics,
-            view_j.camera.intrinsics,
-            jTi,
-            self._flow_config,
+        self.guided_all([(i, j)])
+
+    def temporal_all(self, pairs: Iterable[tuple[Keyframe, Keyframe]]) -> None:
+        """``temporal`` for each pair, side by side; no pair may appear twice."""
+        self._measure(
+            self._guided_job(i, j)
+            if self.predicted_length(i, j) > self._config.guided_px
+            else self._plain_job(i, j)
+            for i, j in pairs
         )
-        self._store(i, j, pair)
-        i.guides[j.frame] = Guide(i.log_depth, jTi)
-        j.guides[i.frame] = Guide(j.log_depth, invert_pose(jTi))
+
+    def guided_all(self, pairs: Iterable[tuple[Keyframe, Keyframe]]) -> None:
+        """``guided`` for each pair, side by side; no pair may appear twice."""
+        self._measure(self._guided_job(i, j) for i, j in pairs)
+
+    def _measure(self, jobs: Iterator[_Job]) -> None:
+        """Run the jobs and store what they find, in their order; few at a time, for they hold images."""
+        if self._pool is None:
+            for job in jobs:
+                self._store(job, job.run())
+            return
+        running: deque[tuple[_Job, Future[GridFlows]]] = deque()
+        for job in jobs:
+            running.append((job, self._pool.submit(job.run)))
+            if len(running) > 2 * self._workers:
+                done, future = running.popleft()
+                self._store(done, future.result())
+        for done, future in running:
+            self._store(done, future.result())
+
+    def _store(self, job: _Job, flows: GridFlows) -> None:
+        i, j = job.i, job.j
+        i.flows[j.frame], j.flows[i.frame] = flows
+        if job.guides is None:
+            i.guides.pop(j.frame, None)
+            j.guides.pop(i.frame, None)
+        else:
+            i.guides[j.frame], j.guides[i.frame] = job.guides
+
+    def _plain_job(self, i: Keyframe, j: Keyframe) -> _Job:
+        grid_i, grid_j = self._views[i.camera].grid, self._views[j.camera].grid
+        images = self._images.get(i.frame), self._images.get(j.frame)
+        if isinstance(self._flow, OneWayFlow):
+            return _Job(i, j, None, partial(measure_grid, self._flow, *images, grid_i, grid_j))
+        return _Job(i, j, None, partial(_measure_dense, self._flow, *images, grid_i, grid_j))
+
+    def _guided_job(self, i: Keyframe, j: Keyframe) -> _Job:
+        jTi = invert_pose(j.wTc) @ i.wTc
+        guides = Guide(i.log_depth, jTi), Guide(j.log_depth, invert_pose(jTi))
+        views = self._grid_view(i), self._grid_view(j)
+        images = self._images.get(i.frame), self._images.get(j.frame)
+        if isinstance(self._flow, OneWayFlow):
+            run = partial(guide_grid, self._flow, *images, *views, jTi, self._flow_config)
+        else:
+            run = partial(_guide_dense, self._flow, *images, *views, jTi, self._flow_config)
+        return _Job(i, j, guides, run)
 
     def outdated(self, i: Keyframe, j: Keyframe) -> bool:
         """Whether depth and poses now predict another flow than the one it was guided by."""
@@ -90,23 +148,45 @@ class EdgeMeasurer:
             np.mean(np.where(seen.valid[0], np.minimum(length, view.camera.width), view.camera.width))
         )
 
-    def _store(self, i: Keyframe, j: Keyframe, pair: FlowPair) -> None:
-        forward, backward = sample_pair(pair, self._views[i.camera].grid, self._views[j.camera].grid)
-        i.flows[j.frame], j.flows[i.frame] = forward, backward
-
-    def _dense_depth(self, keyframe: Keyframe) -> npt.NDArray[np.float32]:
-        """``(H, W)`` smooth depth between the grid points; kept while the keyframe's depth stays the same."""
-        kept = self._dense.get(id(keyframe))
-        if kept is not None and kept[0] is keyframe.log_depth:
-            self._dense.move_to_end(id(keyframe))
-            return kept[1]
+    def _grid_view(self, keyframe: Keyframe) -> GridView:
+        """Smooth depth at the grid; kept while the keyframe's depth stays the same."""
         view = self._views[keyframe.camera]
-        smooth = smoothed_log_depth(keyframe.log_depth, keyframe.information, view.grid)
-        dense = np.exp(view.grid.expand(smooth, view.camera.width, view.camera.height))
-        self._dense[id(keyframe)] = (keyframe.log_depth, dense)
-        while len(self._dense) > 40:
-            self._dense.popitem(last=False)
-        return dense
+        kept = self._smooth.get(id(keyframe))
+        if kept is not None and kept[0] is keyframe.log_depth:
+            self._smooth.move_to_end(id(keyframe))
+            depth = kept[1]
+        else:
+            depth = np.exp(smoothed_log_depth(keyframe.log_depth, keyframe.information, view.grid))
+            self._smooth[id(keyframe)] = (keyframe.log_depth, depth)
+            while len(self._smooth) > 1000:
+                self._smooth.popitem(last=False)
+        size = view.camera.width, view.camera.height
+        return GridView(view.grid, size, view.camera.intrinsics, depth)
+
+
+def _measure_dense(
+    flow: DenseFlow,
+    image_i: npt.NDArray[np.uint8],
+    image_j: npt.NDArray[np.uint8],
+    grid_i: Grid,
+    grid_j: Grid,
+) -> GridFlows:
+    return sample_pair(flow.measure(image_i, image_j), grid_i, grid_j)
+
+
+def _guide_dense(
+    flow: DenseFlow,
+    image_i: npt.NDArray[np.uint8],
+    image_j: npt.NDArray[np.uint8],
+    view_i: GridView,
+    view_j: GridView,
+    jTi: Array,
+    config: FlowConfig,
+) -> GridFlows:
+    depth_i, depth_j = (np.exp(view.grid.expand(np.log(view.depth), *view.size)) for view in (view_i, view_j))
+    intrinsics = view_i.intrinsics, view_j.intrinsics
+    pair = guided_flow(flow, image_i, image_j, depth_i, depth_j, *intrinsics, jTi, config)
+    return sample_pair(pair, view_i.grid, view_j.grid)
 
 
 def mean_flow(keyframe: Keyframe, to: Frame, view: View) -> float:

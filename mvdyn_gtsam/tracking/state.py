@@ -15,6 +15,7 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.config import Config
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
+from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
 from mvdyn_gtsam.frontend.start import Start
 from mvdyn_gtsam.graph.connections import ConnectionGraph, Edge, EdgeKind, Frame
 from mvdyn_gtsam.tracking.connect import inter_camera_edges
@@ -39,7 +40,7 @@ class TrackState:
         self.tracking, self.graph_config = config.tracking, config.graph
         self.start, self.units = normalised_start(start)
         self.views = tuple(View.of(camera, config.tracking.grid_points) for camera in cameras)
-        self.images = ImageStore(config.tracking.image_cache_mb * 2**20, read)
+        self.images = ImageStore(config.tracking.image_cache_mb * 2**20, read, isinstance(flow, OneWayFlow))
         self.measurer = EdgeMeasurer(self.views, flow, config.frontend.flow, self.images, config.tracking)
         self.graph = ConnectionGraph(config.graph.max_active_edges)
         self.tracks: list[list[Keyframe]] = [[] for _ in cameras]

@@ -57,12 +57,12 @@ class Tracker:
         touched: dict[Frame, Keyframe] = {}
         for camera, image in enumerate(frames):
             self.state.images.put((camera, time), image)
-            candidate = self._candidate(camera, time)
+        for candidate in self._candidates(time):
             if self._is_keyframe(candidate):
-                self._promote(candidate, touched)
                 new.append(candidate)
             else:
-                self.state.others[camera].append(candidate)
+                self.state.others[candidate.camera].append(candidate)
+        self._promote(new, touched)
         self.state.count_time("temporal", began)
         self._solve_step(new, touched)
         counts = self.state.graph.record(time)
@@ -76,26 +76,34 @@ class Tracker:
 
     # ---- one frame -----------------------------------------------------------------------------------
 
-    def _candidate(self, camera: int, time: int) -> Keyframe:
-        """The new frame with a pose and depths, measured against the last keyframe of its camera."""
-        view = self.state.views[camera]
-        track = self.state.tracks[camera]
-        predictions = self._predictions(camera, time)
-        sparse = self._nearest_start(camera, time)
-        if not track:
-            log_depth = sparse_log_depth(sparse.pixels, sparse.depth, view.grid)
-            return self._keyframe(camera, time, predictions[0], log_depth)
-        last = track[-1]
-        frame = self._keyframe(camera, time, predictions[0], last.log_depth)
-        # only a stand-in until flow says better: where the flow is guided, the depth must belong to this view
-        self.state.measurer.temporal(last, frame)
-        self.state.locate(frame, [last], predictions)
-        if frame.frame in last.guides:
+    def _candidates(self, time: int) -> list[Keyframe]:
+        """The new frames with poses and depths, measured against the last keyframes of their cameras."""
+        new: list[Keyframe] = []
+        followed: list[tuple[Keyframe, Keyframe, list[Array]]] = []
+        for camera, track in enumerate(self.state.tracks):
+            predictions = self._predictions(camera, time)
+            if track:
+                # the depth is only a stand-in until flow says better
+                frame = self._keyframe(camera, time, predictions[0], track[-1].log_depth)
+                followed.append((track[-1], frame, predictions))
+            else:
+                sparse = self._nearest_start(camera, time)
+                log_depth = sparse_log_depth(sparse.pixels, sparse.depth, self.state.views[camera].grid)
+                frame = self._keyframe(camera, time, predictions[0], log_depth)
+            new.append(frame)
+        self.state.measurer.temporal_all([(last, frame) for last, frame, _ in followed])
+        # where the flow is guided, the depth must belong to the new view: measured with that once more
+        guided = [one for one in followed if one[1].frame in one[0].guides]
+        for last, frame, predictions in followed:
+            self.state.locate(frame, [last], predictions)
+        for last, frame, _ in guided:
             self.state.carry_depth(frame, last)
-            self.state.measurer.guided(last, frame)
+        self.state.measurer.guided_all([(last, frame) for last, frame, _ in guided])
+        for last, frame, predictions in guided:
             self.state.locate(frame, [last], [frame.wTc, *predictions])
-        self.state.carry_depth(frame, last)
-        return frame
+        for last, frame, _ in followed:
+            self.state.carry_depth(frame, last)
+        return new
 
     def _keyframe(self, camera: int, time: int, wTc: Array, log_depth: Array) -> Keyframe:
         sigma = np.full(len(log_depth), self.state.tracking.carried_sigma)
@@ -138,25 +146,29 @@ class Tracker:
 
     # ---- keyframes and their connections ---------------------------------------------------------------
 
-    def _promote(self, frame: Keyframe, touched: dict[Frame, Keyframe]) -> None:
-        """Make a frame a keyframe: temporal and inter-camera connections, measured."""
-        track = self.state.tracks[frame.camera]
-        self._forget_candidates(frame)
-        touched[frame.frame] = frame
+    def _promote(self, new: Sequence[Keyframe], touched: dict[Frame, Keyframe]) -> None:
+        """Make frames of different cameras keyframes: temporal connections, measured."""
         edges: list[Edge] = []
-        offsets = [offset for offset in self.state.graph_config.temporal_offsets if offset <= len(track)]
-        for offset in offsets:
-            other = track[-offset]
-            if not self.state.images.available(other.frame):
-                continue
-            edges.append(Edge(frame.frame, other.frame, EdgeKind.TEMPORAL))
-            if frame.frame not in other.flows:
-                self.state.measurer.temporal(other, frame)
-            # each renewal takes in all flow gathered since the last: early for depth, late for completeness
-            if offset in (offsets[0], self.state.graph_config.temporal_offsets[-1]):
-                touched[other.frame] = other
-        track.append(frame)
-        self.state.frames[frame.frame] = frame
+        unmeasured: list[tuple[Keyframe, Keyframe]] = []
+        for frame in new:
+            track = self.state.tracks[frame.camera]
+            self._forget_candidates(frame)
+            touched[frame.frame] = frame
+            offsets = [offset for offset in self.state.graph_config.temporal_offsets if offset <= len(track)]
+            for offset in offsets:
+                other = track[-offset]
+                if not self.state.images.available(other.frame):
+                    continue
+                edges.append(Edge(frame.frame, other.frame, EdgeKind.TEMPORAL))
+                if frame.frame not in other.flows:
+                    unmeasured.append((other, frame))
+                # a renewal takes in all flow since the last: early for depth, late for completeness
+                if offset in (offsets[0], self.state.graph_config.temporal_offsets[-1]):
+                    touched[other.frame] = other
+        self.state.measurer.temporal_all(unmeasured)
+        for frame in new:
+            self.state.tracks[frame.camera].append(frame)
+            self.state.frames[frame.frame] = frame
         self.state.add_edges(edges)
 
     def _forget_candidates(self, frame: Keyframe) -> None:
@@ -170,11 +182,12 @@ class Tracker:
                 del last.flows[other]
 
     def _connect_cameras(self, new: Sequence[Keyframe]) -> None:
+        unmeasured: list[tuple[Keyframe, Keyframe]] = []
         for frame in new:
             edges = self.state.edges_to_other_cameras(frame, self.state.graph_config.st_per_frame)
-            for edge in edges:
-                self.state.measurer.guided(frame, self.state.frames[edge.j])
+            unmeasured += [(frame, self.state.frames[edge.j]) for edge in edges]
             self.state.add_edges(edges)
+        self.state.measurer.guided_all(unmeasured)
 
     def _solve_step(self, new: list[Keyframe], touched: dict[Frame, Keyframe]) -> None:
         if not new:
@@ -209,9 +222,8 @@ class Tracker:
         touched: dict[Frame, Keyframe] = {}
         for others in self.state.others:
             if others and others[-1].time == self.state.last_time:
-                frame = others.pop()
-                self._promote(frame, touched)
-                new.append(frame)
+                new.append(others.pop())
+        self._promote(new, touched)
         self._solve_step(new, touched)
 
     def _check_step(self, time: int, frames: Sequence[Image]) -> None:
