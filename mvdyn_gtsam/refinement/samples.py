@@ -1,0 +1,32 @@
+"""What the pose and scale solves see of a frame: some of its pixels with their flow to all its neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.graph.connections import Frame
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameSample:
+    """``M`` pixels of frame i and their flow to ``K`` neighbours."""
+
+    i: Frame
+    neighbours: tuple[Frame, ...]
+    rays: Array
+    """``(M, 3)`` with z = 1."""
+    inverse_depth: Array
+    """``(M,)`` of frame i."""
+    intrinsics: Array
+    """``(K, 3, 3)`` of the neighbours, in the pixels of ``target``."""
+    target: Array
+    """``(K, M, 2)`` px of the input resolution."""
+    weight: Array
+    """``(K, M)`` at least 0; 0 where there is no flow."""
+    inverse_depth_there: Array
+    """``(K, M)`` inverse depth that the neighbours have at the targets; NaN outside."""
