@@ -99,12 +99,19 @@ def solve_log_depths(
     return solution.log_depth, solution.hessian
 
 
-def linearize(measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float) -> Array:
+def linearize(
+    measurement: StructurelessMeasurement,
+    wTi: Array,
+    wTj: Array,
+    log_scale: float,
+    solved: Array | None = None,
+) -> Array:
     """Compressed rows ``(6 E + 2, 6 (E + 1) + 2)`` = ``[d/dwTi | d/dwTj_1 | ... | d/dlog_scale | error]``.
 
     Derivatives are for right perturbations of the poses. The last column is ``[0, ..., 0, sqrt(2 cost)]``.
+    ``solved`` may hand in the log depths that ``evaluate`` found at the same poses, which saves solving them.
     """
-    solution = _solve(measurement, wTi, wTj, log_scale)
+    solution = _solve(measurement, wTi, wTj, log_scale, solved)
     root = rotate_residual_to_last(compress_gram(_reduced_gram(measurement, solution)))
     twists = 6 * len(wTj)
     rows = np.empty((len(root), twists + 8))
@@ -192,8 +199,15 @@ def _factor_error(
     return rows[:, -1]
 
 
-def _solve(measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float) -> _Solution:
-    """Minimise over each log depth, a scalar Levenberg-Marquardt per point, all points at once."""
+def _solve(
+    measurement: StructurelessMeasurement,
+    wTi: Array,
+    wTj: Array,
+    log_scale: float,
+    solved: Array | None = None,
+) -> _Solution:
+    """Minimise over each log depth, a scalar Levenberg-Marquardt per point, all points at once; or take
+    ``solved``, the result of doing so before."""
     jTi = relative_poses(wTi, wTj)
     rays = edge_rays(measurement.planar_rays, jTi, measurement.intrinsics_j)
     mean = measurement.prior_log_depth + log_scale
@@ -209,12 +223,12 @@ def _solve(measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_sc
         )
         return _point_sums(measurement, terms, log_depth - mean)
 
-    log_depth = measurement.initial_log_depth
+    log_depth = measurement.initial_log_depth if solved is None else solved
     cost, gradient, hessian = at(log_depth)
     curvature = hessian
     damping = np.full(len(log_depth), 1e-4)
     current = True
-    for _ in range(measurement.steps):
+    for _ in range(measurement.steps if solved is None else 0):
         step = -gradient / (curvature * (1.0 + damping) + 1e-12)
         candidate = np.clip(log_depth + np.clip(step, -MAXIMUM_STEP, MAXIMUM_STEP), lower, upper)
         new_cost, new_gradient, new_hessian = at(candidate)

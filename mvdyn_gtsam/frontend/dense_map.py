@@ -7,6 +7,8 @@ tells a good map from a bad one.
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -21,8 +23,9 @@ from factors.structureless import (
 from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_depth import interpolate_sparse_depth
-from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, FlowPair, GridFlow, sample_pair
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, GridFlow, Image, sample_pair, to_grey
 from mvdyn_gtsam.frontend.grid import Grid
+from mvdyn_gtsam.frontend.grid_flow import OneWayFlow, measure_grid, measure_grid_seeded
 from mvdyn_gtsam.frontend.guided_flow import predicted_flow
 from mvdyn_gtsam.frontend.single_camera import CameraMap
 from mvdyn_gtsam.geometry import invert_pose, pixel_rays, transform_points
@@ -37,8 +40,8 @@ class DenseMapConfig:
 
     frames: int = 6
     """Frames of each camera that get dense depth. Source: choice, time."""
-    neighbours: int = 3
-    """Frames of the map before and after that flow is measured to. Source: choice, time."""
+    neighbours: int = 4
+    """Frames of the map before and after that flow is measured to. Source: see ``testimony_flow``."""
     stride: int = 4
     """Pixels between the grid points of the dense depth. Source: choice, time."""
     far_motion: float = 0.06
@@ -82,12 +85,13 @@ class DenseMap:
 
 
 def testimony_flow(config: FlowConfig) -> FlowConfig:
-    """Flow settings for depth that testifies about placements: the finest, and smooth.
+    """Flow settings for depth that testifies about placements: smooth, for completeness decides.
 
-    There is little of it, and completeness decides: on a wall of repeated posters (multicamvideo) the truth
-    leads a shifted placement by 7.9 to 5.1 with it, and by 5.2 to 4.6 without the smoothing.
+    On a wall of repeated posters (multicamvideo) the truth leads a shifted placement by 3.2 to 1.5 with four
+    neighbours. It was 2.8 to 2.3 with three, and 3.4 to 2.6 with three and flow of full resolution, which
+    takes three times as long; with two the shifted one led.
     """
-    return replace(config, finest_scale=0, variational_iterations=5)
+    return replace(config, finest_scale=min(config.finest_scale, 1), variational_iterations=5)
 
 
 Flows = dict[int, GridFlow]
@@ -122,38 +126,46 @@ def _measure_flows(
     last = len(camera_map.times) - 1
     span = range(max(0, frame - config.neighbours), min(last, frame + config.neighbours) + 1)
 
-    def view(index: int) -> tuple[npt.NDArray[np.uint8], Float32]:
-        grey = cv2.cvtColor(capture.read(camera_map.camera, int(camera_map.times[index])), cv2.COLOR_RGB2GRAY)
-        return np.asarray(grey, np.uint8), _sparse_depth(camera_map, index, camera)
+    def view(index: int) -> tuple[Image, Float32]:
+        image = to_grey(capture.read(camera_map.camera, int(camera_map.times[index])))
+        return image, _sparse_depth(camera_map, index, camera)
 
     views = {index: view(index) for index in span}
-    return {
-        other: sample_pair(_measure(camera_map, camera, frame, other, views, flow, config), grid, grid)[0]
-        for other in span
-        if other != frame
-    }
+    others = [other for other in span if other != frame]
+
+    def measure(other: int) -> GridFlow:
+        jTi = invert_pose(camera_map.mTc[other]) @ camera_map.mTc[frame]
+        return _measure(views[frame], views[other], jTi, camera, grid, flow, config)
+
+    if not isinstance(flow, OneWayFlow):
+        return {other: measure(other) for other in others}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return dict(zip(others, pool.map(measure, others), strict=True))
 
 
 def _measure(
-    camera_map: CameraMap,
+    first: tuple[Image, Float32],
+    second: tuple[Image, Float32],
+    jTi: Array,
     camera: Camera,
-    first: int,
-    second: int,
-    recent: dict[int, tuple[npt.NDArray[np.uint8], Float32]],
+    grid: Grid,
     flow: DenseFlow,
     config: DenseMapConfig,
-) -> FlowPair:
-    (image_i, depth_i), (image_j, depth_j) = recent[first], recent[second]
+) -> GridFlow:
+    """Flow at the grid between two frames of one camera, given as image and rough depth."""
+    (image_i, depth_i), (image_j, depth_j) = first, second
     intrinsics = camera.intrinsics
-    jTi = invert_pose(camera_map.mTc[second]) @ camera_map.mTc[first]
     seed = predicted_flow(depth_i, intrinsics, intrinsics, jTi, image_j.shape)
-    motion = (
-        np.nanmedian(np.linalg.norm(seed[::8, ::8], axis=-1)) if np.isfinite(seed[::8, ::8]).any() else np.inf
-    )
+    sparse = seed[::8, ::8]
+    motion = np.nanmedian(np.linalg.norm(sparse, axis=-1)) if np.isfinite(sparse).any() else np.inf
     if motion < config.far_motion * camera.width:
-        return flow.measure(image_i, image_j)
-    seed_backward = predicted_flow(depth_j, intrinsics, intrinsics, invert_pose(jTi), image_i.shape)
-    return flow.measure(image_i, image_j, seed, seed_backward)
+        if isinstance(flow, OneWayFlow):
+            return measure_grid(flow, image_i, image_j, grid, grid)[0]
+        return sample_pair(flow.measure(image_i, image_j), grid, grid)[0]
+    seed_back = predicted_flow(depth_j, intrinsics, intrinsics, invert_pose(jTi), image_i.shape)
+    if isinstance(flow, OneWayFlow):
+        return measure_grid_seeded(flow, image_i, image_j, grid, grid, seed, seed_back)[0]
+    return sample_pair(flow.measure(image_i, image_j, seed, seed_back), grid, grid)[0]
 
 
 def _sparse_depth(camera_map: CameraMap, frame: int, camera: Camera) -> Float32:

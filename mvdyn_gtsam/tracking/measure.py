@@ -132,7 +132,7 @@ class EdgeMeasurer:
         view_i, intrinsics = self._views[i.camera], self._views[j.camera].intrinsics[None]
         used = i.flows[j.frame].weight > 0.0
         if not used.any():
-            return float("inf")
+            used = np.ones_like(used)
         identity = np.eye(4)
         before = reproject(view_i.rays[used], guide.log_depth[used], guide.jTi, identity[None], intrinsics)
         jTi = invert_pose(j.wTc) @ i.wTc

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
 
 from factors.keys import S, X
+from factors.measurement import StructurelessMeasurement
 from factors.projection import reproject
 from mvdyn_gtsam.config import TrackingConfig
 from mvdyn_gtsam.graph.connections import Frame
@@ -24,6 +26,10 @@ SHORT_RUN = 3
 """Levenberg-Marquardt iterations between two searches along the way."""
 LONGEST_SEARCH = 5
 """Doublings of a search."""
+KEPT_BYTES = 128 * 2**20
+"""Memory for measurements that are kept between linearisations; those beyond are built each time."""
+BYTES_PER_MEASUREMENT = 40
+"""Of one point and edge in double precision: target, weight, information, and what they are made of."""
 METIS_FROM = 800
 """Variables from which nested dissection orders better than COLAMD."""
 
@@ -158,6 +164,7 @@ def build_graph(
     """One structureless factor per keyframe over all it was measured against, and the priors."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     members = {keyframe.frame for keyframe in keyframes}
+    room = KEPT_BYTES
     for keyframe in keyframes:
         values.insert(X(*keyframe.frame), gtsam.Pose3(keyframe.wTc))
         values.insert(S(*keyframe.frame), keyframe.log_scale)
@@ -166,8 +173,12 @@ def build_graph(
         neighbours = [frame for frame in useful_neighbours(keyframe) if frame in members]
         if neighbours:
             snapshot = replace(keyframe, flows=dict(keyframe.flows))
-            measure = partial(
+            measure: Callable[[], StructurelessMeasurement] = partial(
                 measurement_of, snapshot, neighbours, views, config, thin=thin, robust_px=robust_px
             )
+            size = BYTES_PER_MEASUREMENT * len(neighbours) * len(keyframe.log_depth)
+            if size <= room:
+                room -= size
+                measure = cache(measure)
             graph.add(keyframe_factor(keyframe.frame, neighbours, {}, measure))
     return graph, values

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import gtsam
 import numpy as np
@@ -117,7 +117,7 @@ class SlidingWindow:
             thin=True,
             robust_px=self._config.window_robust_px,
         )
-        return keyframe_factor(keyframe.frame, neighbours, fixed, measure)
+        return keyframe_factor(keyframe.frame, neighbours, fixed, cache(measure))
 
     def _settled_keys(self) -> gtsam.KeyList:
         keys = gtsam.KeyList()

@@ -254,6 +254,19 @@ def test_error_agrees_with_and_without_jacobians() -> None:
     np.testing.assert_allclose(factor.unwhitenedError(values), -rhs, rtol=1e-10)
 
 
+@pytest.mark.parametrize("steps", [2, 4])
+def test_depths_solved_before_give_the_same_rows(steps: int) -> None:
+    rng = np.random.default_rng(3)
+    scene = make_scene(rng, 60, 3)
+    measurement = _noisy(scene, rng, steps=steps)
+    poses = matrices(perturbed(rng, scene.poses, 0.02))
+    _, solved = evaluate(measurement, poses[0], poses[1:], 0.1)
+    np.testing.assert_array_equal(
+        linearize(measurement, poses[0], poses[1:], 0.1, solved),
+        linearize(measurement, poses[0], poses[1:], 0.1),
+    )
+
+
 def test_fixed_scale_leaves_out_its_column() -> None:
     rng = np.random.default_rng(22)
     scene = make_scene(rng, 40, 2)
