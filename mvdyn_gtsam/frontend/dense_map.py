@@ -7,8 +7,6 @@ tells a good map from a bad one.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -137,10 +135,7 @@ def _measure_flows(
         jTi = invert_pose(camera_map.mTc[other]) @ camera_map.mTc[frame]
         return _measure(views[frame], views[other], jTi, camera, grid, flow, config)
 
-    if not isinstance(flow, OneWayFlow):
-        return {other: measure(other) for other in others}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return dict(zip(others, pool.map(measure, others), strict=True))
+    return {other: measure(other) for other in others}
 
 
 def _measure(

@@ -7,12 +7,10 @@ there even where a joint one is not. What remains unknown is one similarity per 
 from __future__ import annotations
 
 import logging
-import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,60 +82,48 @@ def choose_frames(
     return np.array(chosen), float(travelled[-1])
 
 
-def build_camera_maps(
-    cameras: Sequence[Camera],
-    times: Sequence[npt.NDArray[np.int64]],
-    features: Sequence[Sequence[Features]],
+def build_camera_map(
+    index: int,
+    camera: Camera,
+    times: npt.NDArray[np.int64],
+    features: Sequence[Features],
     *,
     neighbours: int,
     ratio: float,
     minimum_angle_deg: float,
-) -> list[CameraMap]:
-    """Structure from motion of each camera alone, side by side.
+) -> CameraMap:
+    """Structure from motion of camera number ``index`` alone, in a process of its own.
 
     ``neighbours`` frames ahead are matched. A camera whose median triangulation angle stays below
-    ``minimum_angle_deg`` is returned without points.
+    ``minimum_angle_deg`` is returned without points. May be called from several threads.
     """
-    problems = [
-        (index, _match_neighbours(features[index], neighbours, ratio) if len(times[index]) >= 3 else {})
-        for index in range(len(cameras))
-    ]
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
-        solving = [
-            pool.submit(_solve, cameras[index], features[index], pairs, Path(folder) / str(index))
-            if pairs
-            else None
-            for index, pairs in problems
-        ]
-        solutions = [None if job is None else job.result() for job in solving]
-    maps = []
-    for index, solution in enumerate(solutions):
-        own = tuple(features[index])
-        built = _map_without_depth(index, times[index], own)
-        if solution is not None:
-            found = _read_map(index, times[index], own, solution)
-            angle = _median_triangulation_angle_deg(found)
-            logger.info(
-                "%s alone: %d of %d frames, %d points, %.1f degrees of parallax",
-                cameras[index].name,
-                len(found.times),
-                len(times[index]),
-                len(found.points),
-                angle,
-            )
-            built = found if angle >= minimum_angle_deg else built
-        maps.append(built)
-    return maps
+    own = tuple(features)
+    without_depth = _map_without_depth(index, times, own)
+    pairs = _match_neighbours(own, neighbours, ratio) if len(times) >= 3 else {}
+    if not pairs:
+        return without_depth
+    with tempfile.TemporaryDirectory() as folder:
+        found = _read_map(index, times, own, _solve(camera, own, pairs, Path(folder)))
+    angle = _median_triangulation_angle_deg(found)
+    logger.info(
+        "%s alone: %d of %d frames, %d points, %.1f degrees of parallax",
+        camera.name,
+        len(found.times),
+        len(times),
+        len(found.points),
+        angle,
+    )
+    return found if angle >= minimum_angle_deg else without_depth
 
 
 def _solve(
     camera: Camera,
     features: Sequence[Features],
     pairs: dict[tuple[int, int], npt.NDArray[np.int64]],
-    path: Path,
+    folder: Path,
 ) -> dict[str, npt.NDArray[np.float64]]:
     """Structure from motion in a process of its own. Raises TrackingError where it fails."""
-    problem, solution = path.with_suffix(".npz"), path.with_suffix(".out.npz")
+    problem, solution = folder / "problem.npz", folder / "solution.npz"
     _write_problem(problem, camera, features, pairs)
     command = [sys.executable, "-m", "mvdyn_gtsam.frontend.sfm_worker", str(problem), str(solution)]
     finished = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)

@@ -9,8 +9,11 @@ bundle adjustment has the last word.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -21,6 +24,7 @@ from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map
 from mvdyn_gtsam.frontend.features import extract_features
+from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
 from mvdyn_gtsam.frontend.joint_adjustment import AdjustmentConfig, adjust_maps
 from mvdyn_gtsam.frontend.placement import (
     PlacementConfig,
@@ -29,7 +33,7 @@ from mvdyn_gtsam.frontend.placement import (
     match_maps,
     propose_placements,
 )
-from mvdyn_gtsam.frontend.single_camera import CameraMap, build_camera_maps, choose_frames
+from mvdyn_gtsam.frontend.single_camera import CameraMap, build_camera_map, choose_frames
 from mvdyn_gtsam.frontend.start import Start, StartFrame
 from mvdyn_gtsam.frontend.still_cameras import SamePoint, StillConfig, place_still_cameras
 from mvdyn_gtsam.frontend.still_view import StillView, build_still_view, frames_of_view, lone_frames
@@ -109,12 +113,7 @@ class ClassicalInitializer:
         """See ``WideBaselineInitializer``."""
         progress = progress if progress is not None else NullProgress()
         config = self.config
-        maps = self._maps(capture, progress)
-        dense = {
-            camera_map.camera: densify_map(capture, camera_map, self.flow, config.dense_map)
-            for camera_map in maps
-            if camera_map.has_depth
-        }
+        maps, dense = self._maps(capture, progress)
         links, matches = self._links(capture, dense, progress)
         views = self._still_views(capture, [m.camera for m in maps if not m.has_depth])
         placed = place_still_cameras(
@@ -178,27 +177,41 @@ class ClassicalInitializer:
         intrinsics_a, intrinsics_b = capture.cameras[a].intrinsics, capture.cameras[b].intrinsics
         return agreeing_pairs(matches, aSb, intrinsics_a, intrinsics_b, self.config.placement)
 
-    def _maps(self, capture: Capture, progress: Progress) -> list[CameraMap]:
+    def _maps(self, capture: Capture, progress: Progress) -> tuple[list[CameraMap], dict[int, DenseMap]]:
+        """The map of every camera, and its dense depth where it has any; cameras side by side."""
+        cameras = range(len(capture.cameras))
+        maps: list[CameraMap] = []
+        dense: dict[int, DenseMap] = {}
+        # any other flow than one that may be called from several threads gets one caller
+        workers = os.cpu_count() if isinstance(self.flow, OneWayFlow) else 1
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                for camera, (own, own_dense) in enumerate(pool.map(partial(self._map, capture), cameras)):
+                    maps.append(own)
+                    if own_dense is not None:
+                        dense[camera] = own_dense
+                    progress.update("start", camera + 1, 2 * len(cameras), "one map per camera")
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        return maps, dense
+
+    def _map(self, capture: Capture, camera: int) -> tuple[CameraMap, DenseMap | None]:
         config = self.config
-        times, features = [], []
-        for camera in range(len(capture.cameras)):
-            chosen, _ = choose_frames(capture, camera, config.frame_step, config.maximum_frames)
-            times.append(chosen)
-            features.append(
-                [
-                    extract_features(capture.read(camera, int(t)), config.features, config.contrast)
-                    for t in chosen
-                ]
-            )
-            progress.update("start", camera + 1, 2 * len(capture.cameras), "features")
-        return build_camera_maps(
-            capture.cameras,
+        times, _ = choose_frames(capture, camera, config.frame_step, config.maximum_frames)
+        features = [
+            extract_features(capture.read(camera, int(t)), config.features, config.contrast) for t in times
+        ]
+        own = build_camera_map(
+            camera,
+            capture.cameras[camera],
             times,
             features,
             neighbours=config.neighbours,
             ratio=config.ratio,
             minimum_angle_deg=config.minimum_parallax_deg,
         )
+        return own, densify_map(capture, own, self.flow, config.dense_map) if own.has_depth else None
 
     def _links(
         self, capture: Capture, dense: Mapping[int, DenseMap], progress: Progress

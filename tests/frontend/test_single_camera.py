@@ -12,7 +12,7 @@ from mvdyn_gtsam.frontend.features import Features, extract_features
 from mvdyn_gtsam.frontend.single_camera import (
     CameraMap,
     _median_triangulation_angle_deg,
-    build_camera_maps,
+    build_camera_map,
     choose_frames,
 )
 from mvdyn_gtsam.geometry import invert_pose, project, rotation_angle_deg, transform_points
@@ -76,9 +76,13 @@ def scene() -> Scene:
 def maps_of(scene: Scene, minimum_angle_deg: float = 1.0) -> list[CameraMap]:
     features = [[extract_features(image, 1000, 0.01) for image in track] for track in scene.images]
     times = [np.arange(len(track)) for track in scene.images]
-    return build_camera_maps(
-        scene.cameras, times, features, neighbours=4, ratio=0.8, minimum_angle_deg=minimum_angle_deg
-    )
+    return [
+        build_camera_map(
+            index, camera, times[index], features[index], neighbours=4, ratio=0.8,
+            minimum_angle_deg=minimum_angle_deg,
+        )
+        for index, camera in enumerate(scene.cameras)
+    ]  # fmt: skip
 
 
 @pytest.mark.slow
@@ -127,14 +131,12 @@ def test_two_frames_or_no_matches_are_no_map() -> None:
 
     camera = panning([0, 1]).cameras[0]
     same = noise()
-    maps = build_camera_maps(
-        [camera, camera],
-        [np.array([0, 9]), np.arange(4)],
-        [[same, same], [noise() for _ in range(4)]],
-        neighbours=4,
-        ratio=0.8,
-        minimum_angle_deg=1.0,
-    )
+    maps = [
+        build_camera_map(index, camera, times, features, neighbours=4, ratio=0.8, minimum_angle_deg=1.0)
+        for index, (times, features) in enumerate(
+            [(np.array([0, 9]), [same, same]), (np.arange(4), [noise() for _ in range(4)])]
+        )
+    ]
     assert [one.has_depth for one in maps] == [False, False]
     assert [one.camera for one in maps] == [0, 1]
 
@@ -147,10 +149,11 @@ def test_a_worker_that_fails_is_one_line_with_the_camera(monkeypatch: pytest.Mon
     monkeypatch.setattr(single_camera, "_write_problem", broken)
     view = extract_features(np.repeat(texture((192, 256))[..., None], 3, axis=2), 300, 0.01)
     with pytest.raises(TrackingError, match="structure from motion of pan failed: ") as raised:
-        build_camera_maps(
-            panning([0, 1]).cameras,
-            [np.arange(3)],
-            [[view] * 3],
+        build_camera_map(
+            0,
+            panning([0, 1]).cameras[0],
+            np.arange(3),
+            [view] * 3,
             neighbours=2,
             ratio=0.8,
             minimum_angle_deg=1.0,
