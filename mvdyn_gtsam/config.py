@@ -47,6 +47,10 @@ class GraphConfig:
     """Share of the projected grid that must land in the other image for a spatial edge. Source: paper."""
     temporal_offsets: tuple[int, ...] = (1, 2, 4, 8)
     """Frame distances of temporal edges, both directions. Source: measured, DIS flow at 512x384."""
+    temporal_overlap: float = 0.4
+    """Visible share of the grid that a temporal edge beyond the last keyframe needs. Source: measured, fast
+    hand-held motion (hololens_office_2seg): below it flow finds next to nothing, and the poses came out alike
+    with 0, 0.2 and 0.4."""
     max_active_edges: int = 96
     """Inter-camera edges kept in the active window; the oldest go first. Source: paper supplement, edge
     ablation."""
@@ -129,9 +133,10 @@ class TrackingConfig:
     robodog_overlap from 0.37 to 0.30 mm and doubled the polish."""
     polish_iterations: int = 12
     """Levenberg-Marquardt iterations per solve of the polish. Source: experiments/tracking_sweep.py."""
-    remeasure_px: float = 0.3
+    remeasure_px: float = 0.5
     """Median change of a guided flow's prediction beyond which the polish measures it again, px. Source:
-    choice, not swept."""
+    measured: 0.3, 0.5 and 1.0 gave 25.2, 25.2 and 25.1 mm on hololens_office_2seg; on dynamic_human
+    0.3 gave 2.4 mm and 1.0 gave 2.6."""
     polish_tolerance: float = 1e-6
     """Relative decrease of the cost at which a solve of the polish ends. Source: choice; 1e-4 ended
     far from the minimum."""

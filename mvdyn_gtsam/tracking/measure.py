@@ -148,6 +148,14 @@ class EdgeMeasurer:
             np.mean(np.where(seen.valid[0], np.minimum(length, view.camera.width), view.camera.width))
         )
 
+    def predicted_overlap(self, i: Keyframe, j: Keyframe) -> float:
+        """Share of the grid of i that depth and poses put inside image j."""
+        view_i, view_j = self._views[i.camera], self._views[j.camera]
+        seen = reproject(view_i.rays, i.log_depth, i.wTc, j.wTc[None], view_j.intrinsics[None])
+        last = [view_j.camera.width - 1, view_j.camera.height - 1]
+        inside = ((seen.pixels[0] >= 0.0) & (seen.pixels[0] <= last)).all(axis=1)
+        return float(np.mean(inside & seen.valid[0]))
+
     def _grid_view(self, keyframe: Keyframe) -> GridView:
         """Smooth depth at the grid; kept while the keyframe's depth stays the same."""
         view = self._views[keyframe.camera]

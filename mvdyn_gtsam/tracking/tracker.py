@@ -157,7 +157,7 @@ class Tracker:
             offsets = [offset for offset in self.state.graph_config.temporal_offsets if offset <= len(track)]
             for offset in offsets:
                 other = track[-offset]
-                if not self.state.images.available(other.frame):
+                if not self.state.images.available(other.frame) or self._out_of_sight(other, frame, offset):
                     continue
                 edges.append(Edge(frame.frame, other.frame, EdgeKind.TEMPORAL))
                 if frame.frame not in other.flows:
@@ -170,6 +170,11 @@ class Tracker:
             self.state.tracks[frame.camera].append(frame)
             self.state.frames[frame.frame] = frame
         self.state.add_edges(edges)
+
+    def _out_of_sight(self, other: Keyframe, frame: Keyframe, offset: int) -> bool:
+        """Whether a fast camera has turned so far since ``other`` that flow would find next to nothing."""
+        least = self.state.graph_config.temporal_overlap
+        return offset > 1 and self.state.measurer.predicted_overlap(other, frame) < least
 
     def _forget_candidates(self, frame: Keyframe) -> None:
         """Flow of frames that were no keyframes is measured again at the end, to keyframes on both sides."""
