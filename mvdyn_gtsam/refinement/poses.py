@@ -1,0 +1,303 @@
+"""Phase 2, poses: all poses at once with the depth held fixed (paper, "Iterative pose and depth refinement").
+
+Minimises ``L_reproj + L_prior + L_smooth`` over right perturbations ``wTi exp(delta)``, tangent ``[omega,
+v]``. With ``config.joint`` the inverse depth of every sampled pixel is an unknown too (the ablation of the
+paper's supplement) and is eliminated from the system, one division per pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from mvdyn_gtsam.geometry import invert_pose
+from mvdyn_gtsam.refinement.depth import LARGEST_STEP
+from mvdyn_gtsam.refinement.residuals import Float, pose_derivative
+from mvdyn_gtsam.refinement.samples import FrameSample
+from mvdyn_gtsam.refinement.scale import (
+    FrameSystem,
+    PairTerms,
+    Samples,
+    descend,
+    independent_share,
+    normal_terms,
+    pair_terms,
+)
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+
+Array = npt.NDArray[np.float64]
+
+
+def solve_poses(
+    samples: Samples,
+    wTc: Array,
+    prior_wTc: Array,
+    groups: Sequence[Sequence[int]],
+    config: RefinementConfig,
+    iterations: int | None = None,
+) -> Array:
+    """Poses ``(N, T, 4, 4)`` that minimise ``L_reproj + L_prior + L_smooth``, starting from ``wTc``.
+
+    ``prior_wTc`` are the tracked poses of L_prior. ``groups`` are the cameras that share a world: the first
+    frame of the first camera of each is held fixed, as is every camera of a group without samples.
+    ``samples`` is called once per iteration (``config.pose_iterations`` where not given), twice with
+    ``config.joint``; the cost never rises.
+    """
+    problem = PoseProblem(samples, prior_wTc, groups, config)
+    count = config.pose_iterations if iterations is None else iterations
+    state = PoseState(np.array(wTc, np.float64), None)
+    return descend(state, problem.evaluate, problem.direction, problem.move, count).wTc
+
+
+@dataclass(frozen=True)
+class PoseState:
+    """What the solve changes."""
+
+    wTc: Array
+    """``(N, T, 4, 4)``"""
+    depth_change: tuple[Array, ...] | None
+    """In joint mode, for every sample ``(M,)`` what was added to the logarithm of its inverse depth; None
+    before the first step."""
+
+
+@dataclass(frozen=True)
+class _Direction:
+    poses: Array
+    """``(N, T, 6)``"""
+    depth: tuple[Array, ...] | None
+
+
+@dataclass(frozen=True)
+class _SampleTerms:
+    """One sample linearised over its frame and its neighbours."""
+
+    frames: list[int]
+    hessian: Array
+    gradient: Array
+    cost: float
+    depth_information: Array
+    """``(M,)`` of each pixel's log inverse depth."""
+    depth_gradient: Array
+    """``(M,)``"""
+    depth_by_pose: Array
+    """``(M, 6 (1 + K))`` the part of the matrix that couples them; of no rows outside joint mode."""
+
+
+class PoseProblem:
+    """Cost, gradient and normal equations of the poses."""
+
+    def __init__(
+        self, samples: Samples, prior_wTc: Array, groups: Sequence[Sequence[int]], config: RefinementConfig
+    ) -> None:
+        self._samples, self._prior, self._groups, self._config = samples, prior_wTc, groups, config
+        self._shape = (prior_wTc.shape[0], prior_wTc.shape[1])
+        self.free = np.zeros(self._shape, bool)
+        """``(N, T)`` which frames move; known once the cost has been evaluated."""
+
+    def evaluate(self, state: PoseState) -> FrameSystem:
+        """One pass over the samples."""
+        system = FrameSystem(self.free.size, 6)
+        typical = np.full(self._shape, np.nan)
+        for number, sample in enumerate(self._samples()):
+            usable = sample.inverse_depth[sample.inverse_depth > 0.0]
+            if len(usable) == 0:
+                continue
+            typical[sample.i] = 1.0 / np.median(usable)
+            terms = self._linearised(sample, number, state)
+            hessian, gradient = terms.hessian, terms.gradient
+            if self._config.joint:
+                scaled = terms.depth_by_pose / terms.depth_information[:, None]
+                hessian = hessian - terms.depth_by_pose.T @ scaled
+                gradient = gradient - scaled.T @ terms.depth_gradient
+            share = independent_share(sample)
+            system.add(terms.frames, share * hessian, share * gradient, share * terms.cost)
+        self._add_pose_terms(system, state.wTc, typical)
+        return system
+
+    def direction(self, state: PoseState, system: FrameSystem) -> _Direction:
+        """Gauss-Newton step of the poses, and in joint mode of the depths that go with it."""
+        step = system.step(self.free.ravel())
+        if not self._config.joint:
+            return _Direction(step.reshape(*self._shape, 6), None)
+        depth = []
+        for number, sample in enumerate(self._samples()):
+            terms = self._linearised(sample, number, state)
+            moved = terms.depth_gradient + terms.depth_by_pose @ step[terms.frames].ravel()
+            depth.append(np.clip(-moved / terms.depth_information, -LARGEST_STEP, LARGEST_STEP))
+        return _Direction(step.reshape(*self._shape, 6), tuple(depth))
+
+    def move(self, state: PoseState, way: _Direction, share: float) -> PoseState:
+        """A share of a step."""
+        moved = replace(state, wTc=retracted(state.wTc, share * way.poses))
+        if way.depth is None:
+            return moved
+        if state.depth_change is None:
+            return replace(moved, depth_change=tuple(share * step for step in way.depth))
+        before = state.depth_change
+        changes = tuple(old + share * step for old, step in zip(before, way.depth, strict=True))
+        return replace(moved, depth_change=changes)
+
+    def _linearised(self, sample: FrameSample, number: int, state: PoseState) -> _SampleTerms:
+        joint, size = self._config.joint, len(sample.neighbours) + 1
+        count = len(sample.rays) if joint else 0
+        change = np.zeros(count) if state.depth_change is None else state.depth_change[number]
+        rho = sample.inverse_depth * np.exp(change) if joint else sample.inverse_depth
+        hold = self._config.prior_sigma**-2
+        hessian, gradient = np.zeros((6 * size, 6 * size)), np.zeros(6 * size)
+        information, depth_gradient = np.full(count, hold), hold * change
+        coupling = np.zeros((count, 6 * size))
+        cost = 0.5 * hold * float(change @ change)
+        for k, j in enumerate(sample.neighbours):
+            jTi = invert_pose(state.wTc[j]) @ state.wTc[sample.i]
+            terms = pair_terms(sample, k, rho, sample.inverse_depth_there[k], jTi, self._config)
+            cost += terms.cost
+            if len(terms.points) == 0:
+                continue
+            jacobian = _pose_jacobian(sample, k, rho, jTi, terms)
+            columns = np.r_[0:6, 6 * (k + 1) : 6 * (k + 2)]
+            pair_hessian, pair_gradient = normal_terms(jacobian, terms)
+            hessian[np.ix_(columns, columns)] += pair_hessian
+            gradient[columns] += pair_gradient
+            if joint:
+                by_depth = _depth_jacobian(terms, rho)
+                weighted = terms.information * by_depth
+                information[terms.points] += (weighted * by_depth).sum(axis=1)
+                depth_gradient[terms.points] += (weighted * terms.residual).sum(axis=1)
+                coupling[np.ix_(terms.points, columns)] += np.einsum("nc,ncm->nm", weighted, jacobian)
+        frames = [camera * self._shape[1] + time for camera, time in (sample.i, *sample.neighbours)]
+        return _SampleTerms(frames, hessian, gradient, cost, information, depth_gradient, coupling)
+
+    def _add_pose_terms(self, system: FrameSystem, wTc: Array, typical: Array) -> None:
+        self.free[:] = False
+        rotation_sigma = np.radians(self._config.prior_rotation_deg)
+        for group in self._groups:
+            cameras = list(group)
+            depths = typical[cameras][np.isfinite(typical[cameras])]
+            if len(depths) == 0:
+                continue
+            self.free[cameras] = True
+            self.free[cameras[0], 0] = False
+            sigma = np.repeat([rotation_sigma, self._config.prior_translation * float(np.median(depths))], 3)
+            for camera in cameras:
+                self._add_prior(system, camera, wTc[camera], sigma)
+                self._add_smoothness(system, camera, wTc[camera], sigma)
+
+    def _add_prior(self, system: FrameSystem, camera: int, wTc: Array, sigma: Array) -> None:
+        for time, pose in enumerate(wTc):
+            residual, jacobian = prior_terms(self._prior[camera, time], pose)
+            residual, jacobian = residual / sigma, jacobian / sigma[:, None]
+            frame = camera * self._shape[1] + time
+            cost = 0.5 * float(residual @ residual)
+            system.add([frame], jacobian.T @ jacobian, jacobian.T @ residual, cost)
+
+    def _add_smoothness(self, system: FrameSystem, camera: int, wTc: Array, sigma: Array) -> None:
+        config = self._config
+        weights = np.sqrt(np.repeat([config.smooth_rotation, config.smooth_translation], [9, 3]))
+        weights = weights / np.repeat(sigma[[0, 3]], [9, 3])
+        if not weights.any():
+            return
+        for time in range(self._shape[1] - 1):
+            residual, jacobian = smoothness_terms(wTc[time], wTc[time + 1])
+            residual, jacobian = residual * weights, jacobian * weights[:, None]
+            frame = camera * self._shape[1] + time
+            cost = 0.5 * float(residual @ residual)
+            system.add([frame, frame + 1], jacobian.T @ jacobian, jacobian.T @ residual, cost)
+
+
+def ratio_pose_derivative(inverse_depth: Float, rays: Float, jTi: Array) -> tuple[Array, Array]:
+    """Derivatives ``(N, 6)`` of the residual of L_disp by right perturbations of ``wTi`` and of ``wTj``.
+
+    The residual is ``log rho_i - log rho_j - log z`` with ``z`` the depth in j over that in i. The point
+    divided by its depth in i moves by ``omega x ray + rho v`` in frame i and by ``-(omega x p + rho v)`` in
+    frame j.
+    """
+    point = rays @ jTi[:3, :3].T + inverse_depth[:, None] * jTi[:3, 3]
+    axis_i = np.broadcast_to(jTi[2, :3], rays.shape)
+    axis_j = np.broadcast_to(np.array([0.0, 0.0, 1.0]), rays.shape)
+    scale = 1.0 / point[:, 2:]
+    by_wTi = -scale * np.concatenate([np.cross(rays, axis_i), inverse_depth[:, None] * axis_i], axis=1)
+    by_wTj = scale * np.concatenate([np.cross(point, axis_j), inverse_depth[:, None] * axis_j], axis=1)
+    return by_wTi, by_wTj
+
+
+def prior_terms(prior_wTc: Array, wTc: Array) -> tuple[Array, Array]:
+    """L_prior of one pose: residual ``(6,)`` ``[log(R0^T R), R0^T (t - t0)]`` and its derivative ``(6, 6)``.
+
+    The paper's ``delta`` with its translation not bent by its rotation, which at the hundredths of a degree
+    in question is the same.
+    """
+    turn = prior_wTc[:3, :3].T @ wTc[:3, :3]
+    omega = Rotation.from_matrix(turn).as_rotvec()
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = _inverse_right_jacobian(omega)
+    jacobian[3:, 3:] = turn
+    return np.concatenate([omega, prior_wTc[:3, :3].T @ (wTc[:3, 3] - prior_wTc[:3, 3])]), jacobian
+
+
+def smoothness_terms(wTc: Array, next_wTc: Array) -> tuple[Array, Array]:
+    """L_smooth of two consecutive poses: residual ``(12,)`` of ``R_t^T R_t+1 - I`` by rows and ``t_t -
+    t_t+1``, and its derivative ``(12, 12)`` by right perturbations of both."""
+    turn = wTc[:3, :3].T @ next_wTc[:3, :3]
+    residual = np.concatenate([(turn - np.eye(3)).ravel(), wTc[:3, 3] - next_wTc[:3, 3]])
+    jacobian = np.zeros((12, 12))
+    for axis, generator in enumerate(_cross_matrix(np.eye(3))):
+        jacobian[:9, axis] = (-generator @ turn).ravel()
+        jacobian[:9, 6 + axis] = (turn @ generator).ravel()
+    jacobian[9:, 3:6] = wTc[:3, :3]
+    jacobian[9:, 9:] = -next_wTc[:3, :3]
+    return residual, jacobian
+
+
+def retracted(wTc: Array, delta: Array) -> Array:
+    """``wTc exp(delta)`` of poses ``(..., 4, 4)`` and tangents ``(..., 6)``, ``[omega, v]``."""
+    omega, v = delta[..., :3], delta[..., 3:]
+    shape = omega.shape[:-1]
+    angle = np.linalg.norm(omega, axis=-1)[..., None, None]
+    cross = _cross_matrix(omega)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    # integral of the rotation over the way: I + (1 - cos a)/a^2 [w] + (a - sin a)/a^3 [w]^2
+    first = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    way = (np.eye(3) + first * cross + second * cross @ cross) @ v[..., None]
+    turn = Rotation.from_rotvec(omega.reshape(-1, 3)).as_matrix().reshape(*shape, 3, 3)
+    result = wTc.copy()
+    result[..., :3, :3] = wTc[..., :3, :3] @ turn
+    result[..., :3, 3] += (wTc[..., :3, :3] @ way)[..., 0]
+    return result
+
+
+def _pose_jacobian(sample: FrameSample, k: int, rho: Array, jTi: Array, terms: PairTerms) -> Array:
+    """``(n, 3, 12)`` of the residuals of a pair by both poses."""
+    rays, depth = sample.rays[terms.points], rho[terms.points]
+    flow = pose_derivative(depth, rays, jTi, sample.intrinsics[k])
+    ratio = ratio_pose_derivative(depth, rays, jTi)
+    return np.concatenate([np.concatenate(flow, axis=2), np.concatenate(ratio, axis=1)[:, None]], axis=1)
+
+
+def _depth_jacobian(terms: PairTerms, rho: Array) -> Array:
+    """``(n, 3)`` of the residuals of a pair by the logarithm of the inverse depth."""
+    by_rho = np.column_stack([terms.flow.by_inverse_depth, terms.ratio.by_inverse_depth_i])
+    return by_rho * rho[terms.points, None]
+
+
+def _cross_matrix(vectors: Array) -> Array:
+    """``[v]x`` of vectors ``(..., 3)``."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [np.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    return np.stack(rows, axis=-2)
+
+
+def _inverse_right_jacobian(omega: Array) -> Array:
+    """``(3, 3)`` derivative of ``log(exp(omega) exp(d))`` by ``d``."""
+    angle, cross = float(np.linalg.norm(omega)), _cross_matrix(omega)
+    if angle < 1e-3:
+        factor = 1.0 / 12.0 + angle**2 / 720.0
+    else:
+        factor = 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    return np.asarray(np.eye(3) + 0.5 * cross + factor * cross @ cross)
