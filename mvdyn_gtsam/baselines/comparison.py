@@ -21,7 +21,7 @@ from rich.table import Table
 
 from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
 from mvdyn_gtsam.baselines.runner import log_path, read_result, run_worker
-from mvdyn_gtsam.baselines.settings import METHODS, BaselineSettings, Method
+from mvdyn_gtsam.baselines.settings import METHODS, BaselineSettings, Method, Request
 from mvdyn_gtsam.errors import BaselineError, MvdynError
 from mvdyn_gtsam.evaluation import GroundTruth, Scores, evaluate, load_groundtruth
 from mvdyn_gtsam.reconstruction import Reconstruction
@@ -156,7 +156,8 @@ def compare(
             reused = 0.0
         else:
             name: Method = "colmap" if method == "colmap" else "glomap"
-            usage = run_worker(capture, name, folder, settings, database, truncate, timeout_s)
+            request = Request(capture, name, folder, settings or BaselineSettings(), database, truncate)
+            usage = run_worker(request, timeout_s)
             reused = 0.0 if usage.problem else read_result(name, folder, usage).seconds - usage.seconds
         results.append(_result(method, folder, usage, reused, truth))
         if on_finished is not None:

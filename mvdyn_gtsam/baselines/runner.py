@@ -54,25 +54,18 @@ def run_baseline(
     """
     if method not in METHODS:
         raise BaselineError(f"method {method!r} is none of {', '.join(METHODS)}")
-    usage = run_worker(capture, method, out, settings, database, truncate, timeout_s)
+    request = Request(capture, method, out, settings or BaselineSettings(), database, truncate)
+    usage = run_worker(request, timeout_s)
     if usage.problem is not None:
         raise BaselineError(f"{method}: {usage.problem}; log: {log_path(out)}")
     return read_result(method, out, usage)
 
 
-def run_worker(
-    capture: Path,
-    method: Method,
-    out: Path,
-    settings: BaselineSettings | None = None,
-    database: Path | None = None,
-    truncate: bool = False,
-    timeout_s: float | None = None,
-) -> ProcessUsage:
+def run_worker(request: Request, timeout_s: float | None = None) -> ProcessUsage:
     """As :func:`run_baseline`, but a failure is told in the usage and the result is left on disk."""
+    out = request.out
     # Not inside `out`: the worker accepts an empty folder or a reconstruction, nothing else.
     request_path = out.with_name(f"{out.name}.request.json")
-    request = Request(capture, method, out, settings or BaselineSettings(), database, truncate)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         request_path.write_text(json.dumps(request.to_json()))

@@ -31,7 +31,7 @@ class BaselineSettings:
     masks: Path | None = None
     """Folder ``<camera>/<%06d>.png`` with 255 where something moves; no features are taken there."""
     num_threads: int = -1
-    """Threads of every phase; -1: all cores."""
+    """Threads of every phase; -1: all cores, which is also what our own method uses."""
     random_seed: int = 0
     """Fixes RANSAC and the random start of global positioning."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+from abc import abstractmethod
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,11 +37,11 @@ class MediaStream(FrameStream):
     fps: float | None
     """Frames per second where the container says so."""
 
-    def __len__(self) -> int:
-        raise NotImplementedError
+    @abstractmethod
+    def __len__(self) -> int: ...
 
-    def read(self, time: int) -> Image:
-        raise NotImplementedError
+    @abstractmethod
+    def read(self, time: int) -> Image: ...
 
 
 class _FrameCache:

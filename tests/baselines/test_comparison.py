@@ -11,6 +11,7 @@ from rich.console import Console
 from mvdyn_gtsam.baselines import comparison as comparison_module
 from mvdyn_gtsam.baselines.comparison import MethodResult, compare, our_command
 from mvdyn_gtsam.baselines.process import ProcessUsage
+from mvdyn_gtsam.baselines.settings import Request
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import BaselineError
 from mvdyn_gtsam.reconstruction import CaptureInfo, ReconstructionWriter
@@ -53,8 +54,9 @@ def finished(
         )
         return usage()
 
-    def worker(capture: Path, method: str, folder: Path, *_: object) -> ProcessUsage:
-        if method == "colmap":
+    def worker(request: Request, *_: object) -> ProcessUsage:
+        folder = request.out
+        if request.method == "colmap":
             return usage("colmap found no model (exit code 1)")
         partial = {c: p.copy() for c, p in truth.items()}
         partial["cam1"][:3] = np.nan
