@@ -45,7 +45,7 @@ class Scene:
         return np.where(hit, enters, far)
 
     def pairs(self, offsets: Sequence[int] = (1, 2)) -> dict[Frame, tuple[Frame, ...]]:
-        """Neighbours of every frame: within its camera ``offsets`` away in time, and the others at its instant."""
+        """Neighbours of every frame: ``offsets`` away in its camera, and the others at its instant."""
         cameras, times = self.wTc.shape[:2]
         found: dict[Frame, tuple[Frame, ...]] = {}
         for camera, time in self.frames:

@@ -1,4 +1,4 @@
-"""The residuals' derivatives against finite differences, the eliminated confidence against an explicit one."""
+"""Residuals' derivatives against finite differences; the eliminated confidence against an explicit one."""
 
 from __future__ import annotations
 
