@@ -10,6 +10,7 @@ from functools import cache, partial
 import gtsam
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import cho_factor, cho_solve
 
 from factors.keys import S, X
 from factors.measurement import StructurelessMeasurement
@@ -30,6 +31,8 @@ KEPT_BYTES = 128 * 2**20
 """Memory for measurements that are kept between linearisations; those beyond are built each time."""
 BYTES_PER_MEASUREMENT = 40
 """Of one point and edge in double precision: target, weight, information, and what they are made of."""
+LARGEST_INVERSE = 3000
+"""Unknowns up to which one dense inverse is faster than marginals from the Bayes tree; 72 MB."""
 METIS_FROM = 800
 """Variables from which nested dissection orders better than COLAMD."""
 
@@ -149,8 +152,21 @@ def marginal_covariances(
 ) -> dict[Frame, npt.NDArray[np.float64]]:
     """``(6, 6)`` covariance of every keyframe's pose, tangent ``[omega, v]``."""
     graph, values = build_graph(keyframes, views, config, priors)
-    marginals = gtsam.Marginals(graph, values)
-    return {keyframe.frame: marginals.marginalCovariance(X(*keyframe.frame)) for keyframe in keyframes}
+    if 7 * len(keyframes) > LARGEST_INVERSE:
+        marginals = gtsam.Marginals(graph, values)
+        return {keyframe.frame: marginals.marginalCovariance(X(*keyframe.frame)) for keyframe in keyframes}
+    ordering = gtsam.Ordering()
+    for keyframe in keyframes:
+        ordering.push_back(X(*keyframe.frame))
+        ordering.push_back(S(*keyframe.frame))
+    information, _ = graph.linearize(values).hessian(ordering)
+    # unit diagonal: the gauge is held a million times as firmly as the rest
+    scale = 1.0 / np.sqrt(np.diagonal(information))
+    covariance = scale[:, None] * cho_solve(cho_factor(information * scale[:, None] * scale), np.diag(scale))
+    return {
+        keyframe.frame: covariance[7 * row : 7 * row + 6, 7 * row : 7 * row + 6].copy()
+        for row, keyframe in enumerate(keyframes)
+    }
 
 
 def build_graph(
