@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mvdyn_gtsam.graph.connections import Frame
-from mvdyn_gtsam.refinement import scale as scale_module
 from mvdyn_gtsam.refinement.samples import FrameSample
 from mvdyn_gtsam.refinement.scale import (
     FrameSystem,
@@ -16,6 +15,7 @@ from mvdyn_gtsam.refinement.scale import (
     _ScaleProblem,
     descend,
     independent_share,
+    pair_terms,
     robust,
     solve_scales,
 )
@@ -140,17 +140,32 @@ def test_the_prior_holds_the_offset_of_a_frame_without_depth_range(scene: Scene)
 
 
 def test_depth_stays_positive(scene: Scene) -> None:
-    """Depth that would need an offset beyond its nearest pixel is only corrected as far as that allows."""
+    """Most pixels ask for an offset of -3; a few are held nearer than that and stay before the camera."""
 
-    def far_too_near(frame: Frame, depth: Array) -> Array:
-        return np.where(depth > 6.0, depth + 4.0, 0.3)
+    def with_near_pixels(sample: FrameSample) -> FrameSample:
+        depth = sample.inverse_depth.copy()
+        depth[::40] = 1.0 / 0.5
+        return replace(sample, inverse_depth=depth)
 
-    samples = scene.samples(depth_of=far_too_near)
+    samples = [with_near_pixels(s) for s in scene.samples(depth_of=lambda _, depth: depth + 3.0)]
     for iterations in range(1, 8):
         found = solve_scales(stream(samples), scene.wTc, CONFIG, iterations)
         for sample in samples:
             corrected = found.scale[sample.i] / sample.inverse_depth + found.offset[sample.i]
             assert (corrected > 0.0).all()
+    assert (found.scale < 0.8).all() and (found.offset < 0.0).all()
+
+
+def test_it_does_not_pay_to_go_behind_a_camera(scene: Scene) -> None:
+    sample = scene.sample((0, 0), [(0, 1)])
+    behind, ahead = np.eye(4), np.eye(4)
+    behind[2, 3], ahead[0, 3] = -100.0, 0.5
+    costs = [
+        pair_terms(sample, 0, sample.inverse_depth, sample.inverse_depth_there[0], jTi, CONFIG).cost
+        for jTi in (behind, ahead)
+    ]
+    assert costs[0] == pytest.approx(sample.weight.sum() * CONFIG.flow_lambda * (1.0 + np.log(20.0)))
+    assert costs[0] > costs[1]
 
 
 def test_gradient_against_finite_differences(scene: Scene, samples: list[FrameSample]) -> None:
@@ -216,14 +231,15 @@ def test_system_solves_what_a_dense_solver_solves() -> None:
     rng = np.random.default_rng(0)
     system, width, frames = FrameSystem(4, 3), 3, 4
     dense, right = np.zeros((12, 12)), np.zeros(12)
-    for term in ([0], [1], [2], [3], [0, 1], [2, 1], [3, 0, 2]):
+    terms: list[list[int]] = [[0], [1], [2], [3], [0, 1], [2, 1], [3, 0, 2], [3, 3]]
+    for term in terms:
         root = rng.normal(size=(20, width * len(term)))
         gradient = rng.normal(size=width * len(term))
         system.add(term, root.T @ root, gradient, 1.0)
-        index = np.concatenate([np.arange(width) + width * frame for frame in term])
-        dense[np.ix_(index, index)] += root.T @ root
-        right[index] += gradient
-    assert system.cost == 7.0
+        chosen = np.concatenate([np.eye(12)[width * frame : width * (frame + 1)] for frame in term])
+        dense += chosen.T @ root.T @ root @ chosen
+        right += chosen.T @ gradient
+    assert system.cost == 8.0
     free = np.array([True, False, True, True])
     moving = np.repeat(free, width)
     expected = np.zeros(frames * width)
@@ -231,14 +247,15 @@ def test_system_solves_what_a_dense_solver_solves() -> None:
     np.testing.assert_allclose(system.step(free).ravel(), expected, atol=1e-10)
 
 
-def test_descent_gives_up_where_no_step_lowers_the_cost() -> None:
+def test_descent_halves_the_step_until_the_cost_falls_or_gives_up() -> None:
     def evaluate(x: float) -> FrameSystem:
         system = FrameSystem(1, 1)
         system.cost = abs(x)
         return system
 
-    assert descend(1.0, evaluate, lambda x, _: 5.0, lambda x, way, share: x + share * way, 3) == 1.0
-    # 4 / 128 would still be taken: the step is halved until it helps
-    found = descend(1.0, evaluate, lambda x, _: -5.0, lambda x, way, share: x + share * way, 1)
-    assert found == pytest.approx(-0.25)
-    assert scale_module.SMALLEST_STEP < 0.25
+    def move(x: float, way: float, share: float) -> float:
+        return x + share * way
+
+    # 1 - 5 and 1 - 5 / 2 lie farther out than 1, 1 - 5 / 4 does not
+    assert descend(1.0, evaluate, lambda x, _: -5.0, move, 1) == pytest.approx(-0.25)
+    assert descend(1.0, evaluate, lambda x, _: 5.0, move, 3) == 1.0
