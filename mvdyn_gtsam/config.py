@@ -15,6 +15,7 @@ from mvdyn_gtsam.config_tree import ConfigKey, build, describe_tree, parse_overr
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_flow import FlowConfig
 from mvdyn_gtsam.frontend.wide_baseline import WideBaselineConfig
+from mvdyn_gtsam.refinement.settings import RefinementConfig
 
 
 def require(condition: bool, message: str) -> None:
@@ -153,11 +154,6 @@ class TrackingConfig:
             self.depth_prior_lambda >= 0.0,
             f"tracking.depth_prior_lambda is {self.depth_prior_lambda}; it must not be negative",
         )
-
-
-@dataclass(frozen=True)
-class RefinementConfig:
-    """Stage 2: dense per-pixel refinement."""
 
 
 @dataclass(frozen=True)

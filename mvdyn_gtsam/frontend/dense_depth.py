@@ -41,7 +41,7 @@ def upsample_depth(
         raise ValueError("no grid point has a positive depth and weight")
     trust = np.where(usable, np.minimum(weight, 1.0), 0.0).astype(np.float32).reshape(grid.shape)
     log_depth = np.log(np.where(usable, depth, 1.0)).astype(np.float32).reshape(grid.shape)
-    log_depth = _filled(log_depth, trust)
+    log_depth = filled(log_depth, trust)
     grey = cv2.GaussianBlur(to_grey(image), (0, 0), 1.0).astype(np.float32)
     table = np.stack([log_depth, grid.sample(grey).reshape(grid.shape), trust], axis=-1)
     log_dense, confidence = _joint_bilateral(grey, grid, table, contrast)
@@ -71,7 +71,7 @@ def interpolate_sparse_depth(
         raster = pixel_raster((height, width)).reshape(-1, 2)
         values = inverse[cKDTree(points).query(raster)[1]].reshape(height, width).astype(np.float32)
     known = np.isfinite(values).astype(np.float32)
-    return 1.0 / _filled(np.nan_to_num(values), known)
+    return 1.0 / filled(np.nan_to_num(values), known)
 
 
 def _joint_bilateral(grey: Float32, grid: Grid, table: Float32, contrast: float) -> tuple[Float32, Float32]:
@@ -142,8 +142,12 @@ def _like_their_neighbours(
     return kept if kept.any() else np.ones(len(pixels), bool)
 
 
-def _filled(values: Float32, weight: Float32) -> Float32:
-    """``values (R, C)`` where ``weight`` is 1, the average of ever wider surroundings as it falls to 0."""
+def filled(values: Float32, weight: Float32) -> Float32:
+    """``values (R, C)`` where ``weight (R, C)`` is 1, the average of ever wider surroundings as it falls to
+    0.
+
+    Push-pull (https://dl.acm.org/doi/10.1145/237170.237200, section 4): a pyramid of weighted averages.
+    """
     if min(values.shape) == 1 or weight.min() >= 1.0:
         total = float(weight.sum())
         average = np.float32((values * weight).sum() / total) if total > 0.0 else np.float32(0.0)
@@ -152,7 +156,7 @@ def _filled(values: Float32, weight: Float32) -> Float32:
     mass = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
     pulled = cv2.resize(weight * values, size, interpolation=cv2.INTER_AREA)
     coarse = np.divide(pulled, mass, out=np.zeros_like(mass), where=mass > 0.0)
-    around = _filled(coarse, np.minimum(2.0 * mass, 1.0))
+    around = filled(coarse, np.minimum(2.0 * mass, 1.0))
     pushed = cv2.resize(around, values.shape[::-1], interpolation=cv2.INTER_LINEAR)
     result: Float32 = weight * values + (1.0 - weight) * pushed
     return result

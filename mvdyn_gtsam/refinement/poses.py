@@ -39,15 +39,17 @@ def solve_poses(
     groups: Sequence[Sequence[int]],
     config: RefinementConfig,
     iterations: int | None = None,
+    prior_covariance: Array | None = None,
 ) -> Array:
     """Poses ``(N, T, 4, 4)`` that minimise ``L_reproj + L_prior + L_smooth``, starting from ``wTc``.
 
-    ``prior_wTc`` are the tracked poses of L_prior. ``groups`` are the cameras that share a world: the first
-    frame of the first camera of each is held fixed, as is every camera of a group without samples.
-    ``samples`` is called once per iteration (``config.pose_iterations`` where not given), twice with
-    ``config.joint``; the cost never rises.
+    ``prior_wTc`` are the tracked poses of L_prior and ``prior_covariance (N, T, 6, 6)`` theirs, in the unit
+    of the poses; where it is not given or not finite the configured standard deviations hold. ``groups``
+    are the cameras that share a world: the first frame of the first camera of each is held fixed, as is
+    every camera of a group without samples. ``samples`` is called once per iteration
+    (``config.pose_iterations`` where not given), twice with ``config.joint``; the cost never rises.
     """
-    problem = PoseProblem(samples, prior_wTc, groups, config)
+    problem = PoseProblem(samples, prior_wTc, groups, config, prior_covariance)
     count = config.pose_iterations if iterations is None else iterations
     state = PoseState(np.array(wTc, np.float64), None)
     return descend(state, problem.evaluate, problem.direction, problem.move, count).wTc
@@ -91,9 +93,15 @@ class PoseProblem:
     """Cost, gradient and normal equations of the poses."""
 
     def __init__(
-        self, samples: Samples, prior_wTc: Array, groups: Sequence[Sequence[int]], config: RefinementConfig
+        self,
+        samples: Samples,
+        prior_wTc: Array,
+        groups: Sequence[Sequence[int]],
+        config: RefinementConfig,
+        prior_covariance: Array | None = None,
     ) -> None:
         self._samples, self._prior, self._groups, self._config = samples, prior_wTc, groups, config
+        self._prior_covariance = prior_covariance
         self._shape = (prior_wTc.shape[0], prior_wTc.shape[1])
         self.free = np.zeros(self._shape, bool)
         """``(N, T)`` which frames move; known once the cost has been evaluated."""
@@ -189,10 +197,19 @@ class PoseProblem:
     def _add_prior(self, system: FrameSystem, camera: int, wTc: Array, sigma: Array) -> None:
         for time, pose in enumerate(wTc):
             residual, jacobian = prior_terms(self._prior[camera, time], pose)
-            residual, jacobian = residual / sigma, jacobian / sigma[:, None]
+            root = self._prior_root(camera, time, sigma)
+            residual, jacobian = root @ residual, root @ jacobian
             frame = camera * self._shape[1] + time
             cost = 0.5 * float(residual @ residual)
             system.add([frame], jacobian.T @ jacobian, jacobian.T @ residual, cost)
+
+    def _prior_root(self, camera: int, time: int, sigma: Array) -> Array:
+        """``(6, 6)`` whose square is the information of L_prior."""
+        if self._prior_covariance is not None and np.isfinite(self._prior_covariance[camera, time]).all():
+            # the gauge frame's covariance is all but zero
+            covariance = self._prior_covariance[camera, time] + np.diag((1e-3 * sigma) ** 2)
+            return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+        return np.diag(1.0 / sigma)
 
     def _add_smoothness(self, system: FrameSystem, camera: int, wTc: Array, sigma: Array) -> None:
         config = self._config

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -30,3 +33,22 @@ class FrameSample:
     """``(K, M)`` at least 0; 0 where there is no flow."""
     inverse_depth_there: Array
     """``(K, M)`` inverse depth that the neighbours have at the targets; NaN outside."""
+
+
+class SampleStore:
+    """Samples one after the other in a file of the workspace: a solve passes over them many times."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def write(self, samples: Iterable[FrameSample]) -> None:
+        """Replace what the file holds."""
+        with self._path.open("wb") as file:
+            for sample in samples:
+                pickle.dump(sample, file, protocol=pickle.HIGHEST_PROTOCOL)
+
+    def read(self) -> Iterator[FrameSample]:
+        """The samples in the order written, one in memory at a time."""
+        with self._path.open("rb") as file:
+            while file.peek(1):
+                yield pickle.load(file)  # noqa: S301 - written by this very run

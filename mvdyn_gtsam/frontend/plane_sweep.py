@@ -1,0 +1,214 @@
+"""Dense depth by plane sweep: the classical stand-in for a monocular depth network where weights are missing.
+
+For every pixel and every inverse depth of a ladder, patches of other views are compared; semi-global
+aggregation (https://doi.org/10.1109/TPAMI.2007.1166) picks a depth that its neighbours can share. Views of
+the same instant see moving things frozen; views of other times see only what stands still. So a depth may be
+supported by all views together or by those of its instant alone, whichever says more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.errors import ConfigError
+
+Float32 = npt.NDArray[np.float32]
+Array = npt.NDArray[np.float64]
+
+FORBIDDEN = np.float32(1e6)
+"""Cost of stepping off the ladder."""
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """Plane sweep. Choices marked "swept" were compared on rendered scenes, see
+    experiments/depth_proposals.py."""
+
+    scale: float = 0.25
+    """Size of the images swept over the input's. Source: choice; a third took twice as long."""
+    levels: int = 160
+    """Inverse depths tried. Source: choice; about 2 px of the widest pair apart at a quarter of 512x384."""
+    window: int = 5
+    """Side of the compared patches, px of the swept size. Source: choice."""
+    noise: float = 2.0
+    """Image noise, grey levels: patches with less contrast than this say nothing. Source: choice."""
+    unseen: float = 0.3
+    """What a depth gets from a view that would not see it: more than from one that contradicts. Source:
+    swept."""
+    temporal_offsets: tuple[int, ...] = (8, 16)
+    """Distances in frames, both ways, of the other views of the same camera. Source: choice."""
+    temporal_weight: float = 0.75
+    """Say of a view of another time against one of the same instant. Source: swept."""
+    instant_weight: float = 3.0
+    """Say of the views of the same instant when they are believed alone. Source: swept."""
+    prior_weight: float = 1.0
+    """Say of the known depth at full confidence. Source: swept."""
+    prior_tolerance: float = 0.1
+    """Relative depth difference at which the known depth says nothing any more. Source: choice."""
+    small_step: float = 0.4
+    """Cost of a change by one level between neighbours. Source: swept."""
+    large_step: float = 4.0
+    """Cost of any larger change where the image is flat; falls towards ``small_step`` at edges. Source:
+    swept."""
+    edge_contrast: float = 20.0
+    """Grey levels between neighbours at which the cost of a large change has fallen to 1/e. Source: swept."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.scale <= 1.0:
+            raise ConfigError(f"refinement.sweep.scale is {self.scale}; it must be above 0 and at most 1")
+        if self.levels < 3:
+            raise ConfigError(f"refinement.sweep.levels is {self.levels}; it must be at least 3")
+        if self.window < 3 or self.window % 2 == 0:
+            raise ConfigError(f"refinement.sweep.window is {self.window}; it must be odd and at least 3")
+
+
+@dataclass(frozen=True)
+class SweepView:
+    """One view to compare with."""
+
+    grey: npt.NDArray[np.uint8]
+    """``(H_j, W_j)`` of the swept size."""
+    intrinsics: Array
+    """``(3, 3)`` of the swept size."""
+    jTi: Array
+    """``(4, 4)``"""
+    same_instant: bool
+
+
+@dataclass(frozen=True)
+class SweptDepth:
+    """What a sweep found."""
+
+    inverse_depth: Float32
+    """``(h, w)``, finite and positive: supported by all views, as if nothing moved."""
+    instant: Float32
+    """``(h, w)``: supported by the views of the same instant alone; as ``inverse_depth`` without such
+    views."""
+
+
+def sweep(
+    grey: npt.NDArray[np.uint8],
+    intrinsics: Array,
+    views: Sequence[SweepView],
+    ladder: Float32,
+    known: Float32,
+    confidence: Float32,
+    config: SweepConfig,
+) -> SweptDepth:
+    """Inverse depth of an image ``(h, w)`` against ``views`` over evenly spaced inverse depths ``(D,)``.
+
+    ``known`` and ``confidence``, both ``(h, w)``, are an inverse depth believed so far and how far. Raises
+    ValueError for a ladder that is not ascending and positive.
+    """
+    if len(ladder) < 3 or not (ladder[0] > 0.0 and (np.diff(ladder) > 0.0).all()):
+        raise ValueError("the inverse depths to sweep must be positive and ascending, three at least")
+    instant, score = (np.zeros((len(ladder), *grey.shape), np.float32) for _ in range(2))
+    for view in views:
+        likeness = patch_likeness(grey, intrinsics, view, ladder, config)
+        score += np.float32(1.0 if view.same_instant else config.temporal_weight) * likeness
+        if view.same_instant:
+            instant += likeness
+    prior = np.abs(np.log(ladder[:, None, None] / known[None])) / np.float32(config.prior_tolerance)
+    score += np.float32(config.prior_weight) * confidence * (1.0 - np.minimum(prior, 1.0))
+    static = _settled(score, grey, ladder, config)
+    if not any(view.same_instant for view in views):
+        return SweptDepth(static, static)
+    # alone they must carry what all views together carry above
+    return SweptDepth(static, _settled(np.float32(config.instant_weight) * instant, grey, ladder, config))
+
+
+def _settled(score: Float32, grey: npt.NDArray[np.uint8], ladder: Float32, config: SweepConfig) -> Float32:
+    """Inverse depth ``(h, w)`` with the best ``score (D, h, w)`` after aggregation."""
+    total = semi_global(np.ascontiguousarray(-score.transpose(1, 2, 0)), grey, config)
+    level, fraction = lowest(total)
+    inverse_depth = ladder[level] + fraction * (ladder[1] - ladder[0])
+    return np.maximum(inverse_depth, 0.5 * ladder[0]).astype(np.float32)
+
+
+def patch_likeness(
+    grey: npt.NDArray[np.uint8], intrinsics: Array, view: SweepView, ladder: Float32, config: SweepConfig
+) -> Float32:
+    """Normalised cross-correlation ``(D, h, w)`` in [0, 1] with a view at every inverse depth; ``unseen``
+    where the point lies outside its image."""
+    height, width = grey.shape
+    image, other = grey.astype(np.float32), view.grey.astype(np.float32)
+    size = (config.window, config.window)
+    floor = np.float32(config.noise**2)
+    mean = cv2.blur(image, size)
+    deviation = np.sqrt(np.maximum(cv2.sqrBoxFilter(image, cv2.CV_32F, size) - mean * mean, 0.0) + floor)
+    homography = view.intrinsics @ view.jTi[:3, :3] @ np.linalg.inv(intrinsics)
+    epipole = view.intrinsics @ view.jTi[:3, 3]
+    x, y = np.arange(width), np.arange(height)[:, None]
+    far = [(row[0] * x + row[1] * y + row[2]).astype(np.float32) for row in homography]
+    likeness = np.empty((len(ladder), height, width), np.float32)
+    for level, inverse_depth in enumerate(ladder):
+        depth = far[2] + np.float32(inverse_depth * epipole[2])
+        front = depth > 1e-6
+        scale = 1.0 / np.where(front, depth, 1.0)
+        u = (far[0] + np.float32(inverse_depth * epipole[0])) * scale
+        v = (far[1] + np.float32(inverse_depth * epipole[1])) * scale
+        visible = front & (u >= 0) & (v >= 0) & (u <= other.shape[1] - 1) & (v <= other.shape[0] - 1)
+        warped = cv2.remap(other, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        there = cv2.blur(warped, size)
+        variance = np.maximum(cv2.sqrBoxFilter(warped, cv2.CV_32F, size) - there * there, 0.0)
+        covariance = cv2.blur(image * warped, size) - mean * there
+        # correlation below zero is no worse than none: robust against what is hidden
+        correlation = np.maximum(covariance / (deviation * np.sqrt(variance + floor)), 0.0)
+        likeness[level] = np.where(visible, correlation, np.float32(config.unseen))
+    return likeness
+
+
+def semi_global(cost: Float32, grey: npt.NDArray[np.uint8], config: SweepConfig) -> Float32:
+    """Cost ``(h, w, D)`` summed over the cheapest paths from left, right, above and below."""
+    luminance = grey.astype(np.float32)
+    turned, luminance_turned = np.ascontiguousarray(cost.transpose(1, 0, 2)), luminance.T
+    total = _along_rows(cost, luminance, config)
+    total += _along_rows(cost[::-1], luminance[::-1], config)[::-1]
+    total += _along_rows(turned, luminance_turned, config).transpose(1, 0, 2)
+    total += _along_rows(turned[::-1], luminance_turned[::-1], config)[::-1].transpose(1, 0, 2)
+    return total
+
+
+def lowest(cost: Float32) -> tuple[npt.NDArray[np.int64], Float32]:
+    """Level ``(h, w)`` of the lowest of ``cost (h, w, D)`` and the fraction of a level to add, by a
+    parabola."""
+    level = cost.argmin(axis=2)
+    middle = np.clip(level, 1, cost.shape[2] - 2)
+    below, at, above = (
+        np.take_along_axis(cost, (middle + offset)[..., None], axis=2)[..., 0] for offset in (-1, 0, 1)
+    )
+    fraction = 0.5 * (below - above) / np.maximum(below - 2.0 * at + above, 1e-6)
+    return level, np.where(level == middle, np.clip(fraction, -0.5, 0.5), 0.0).astype(np.float32)
+
+
+def ladder_of(inverse_depths: npt.NDArray[np.floating], levels: int) -> Float32:
+    """``levels`` evenly spaced inverse depths that hold those known and what may be nearer or farther."""
+    far, near = np.percentile(inverse_depths, [1.0, 99.0])
+    # What moves is often nearer than anything that was tracked, and far walls are the least known.
+    return np.linspace(0.5 * far, 1.6 * near, levels, dtype=np.float32)
+
+
+def _along_rows(cost: Float32, luminance: Float32, config: SweepConfig) -> Float32:
+    """Cheapest cost ``(h, w, D)`` of paths that run down from the first row."""
+    small, large = np.float32(config.small_step), np.float32(config.large_step)
+    result = np.empty(cost.shape, np.float32)
+    result[0] = cost[0]
+    padded = np.full((cost.shape[1], cost.shape[2] + 2), FORBIDDEN)
+    for row in range(1, len(cost)):
+        previous = result[row - 1]
+        lowest_previous = previous.min(axis=1, keepdims=True)
+        contrast = np.abs(luminance[row] - luminance[row - 1])
+        jump = small + (large - small) * np.exp(contrast / np.float32(-config.edge_contrast))
+        padded[:, 1:-1] = previous
+        best = np.minimum(padded[:, :-2], padded[:, 2:])
+        best += small
+        np.minimum(best, previous, out=best)
+        np.minimum(best, lowest_previous + jump[:, None], out=best)
+        best -= lowest_previous
+        np.add(cost[row], best, out=result[row])
+    return result

@@ -1,0 +1,231 @@
+"""Phase 2, depth: per-pixel inverse depth of a frame with the poses held fixed.
+
+The unknown of a pixel is ``theta = log rho``, the log of its inverse depth. L_flow ties it to the flow,
+L_disp to the depth that other frames have where the flow leads, smoothness to its four neighbours where the
+image has no edge. Every Gauss-Newton step is a sparse symmetric system with five diagonals, solved by
+conjugate gradients with the diagonal as preconditioner; confidences and absolute values are weights,
+renewed at each step. Frames are solved in turn, each with the newest depth of the others: block Gauss-Seidel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse.linalg import cg
+
+from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.edges import Edge
+from mvdyn_gtsam.refinement.residuals import FlowTerms, confidence, ratio_terms, reweighted
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+
+LARGEST_STEP = 0.5
+"""Of ``theta`` per Gauss-Newton step: the linearisation of the flow holds about that far."""
+FLOW_FLOOR_PX = 0.1
+"""Residuals below are noise of the flow: their absolute value is taken for its square."""
+RATIO_FLOOR = 0.005
+"""The same for the ratio of depths."""
+SOLVER_TOLERANCE = 0.02
+"""Relative residual at which conjugate gradients end; the next step corrects what is left."""
+SOLVER_STEPS = 80
+"""Conjugate-gradient steps at most; beyond, what is far from any evidence keeps its depth a little longer."""
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """What a frame's depth is drawn to where flow says little."""
+
+    theta: Float32
+    """``(h, w)`` log inverse depth."""
+    weight: Float32
+    """``(h, w)`` inverse variance."""
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Gauss-Newton system of one frame."""
+
+    matrix: sparse.dia_array
+    """``(N, N)`` symmetric, five diagonals."""
+    gradient: Float32
+    """``(N,)``"""
+    information: Float32
+    """``(N,)`` what the flow alone says about each pixel: inverse variance of ``theta``."""
+
+
+def solve_frame(
+    theta: Float32,
+    edges: Sequence[Edge],
+    others: Mapping[Frame, Float32],
+    image_weights: tuple[Float32, Float32],
+    prior: DepthPrior,
+    config: RefinementConfig,
+    iterations: int,
+) -> tuple[Float32, Float32]:
+    """``theta (h, w)`` after Gauss-Newton steps, and the information ``(h, w)`` that the flow has on it.
+
+    ``others`` holds ``theta`` of the frames that the edges lead to, as far as L_disp shall use them;
+    ``image_weights`` are those of ``smoothness_weights``.
+    """
+    information = np.zeros_like(theta)
+    for iteration in range(iterations):
+        # depth edges are found coarse to fine: a wide kernel first
+        widening = 2.0 ** max(0, iterations - 2 - iteration)
+        normal = normal_equations(theta, edges, others, image_weights, prior, config, widening)
+        preconditioner = sparse.dia_array((1.0 / normal.matrix.diagonal()[None], [0]), normal.matrix.shape)
+        step, _ = cg(
+            normal.matrix, -normal.gradient, rtol=SOLVER_TOLERANCE, maxiter=SOLVER_STEPS, M=preconditioner
+        )
+        theta = theta + np.clip(step, -LARGEST_STEP, LARGEST_STEP).reshape(theta.shape).astype(np.float32)
+        information = normal.information.reshape(theta.shape)
+    return theta, information
+
+
+def normal_equations(
+    theta: Float32,
+    edges: Sequence[Edge],
+    others: Mapping[Frame, Float32],
+    image_weights: tuple[Float32, Float32],
+    prior: DepthPrior,
+    config: RefinementConfig,
+    widening: float = 1.0,
+) -> Normal:
+    """The reweighted cost at ``theta (h, w)`` to second order; arguments as for ``solve_frame``."""
+    information, gradient = np.zeros(theta.size, np.float32), np.zeros(theta.size, np.float32)
+    inverse_depth = np.exp(theta).ravel()
+    for edge in edges:
+        _add_edge(information, gradient, edge, inverse_depth, others.get(edge.j), config)
+    diagonal = information + prior.weight.ravel()
+    gradient += (prior.weight * (theta - prior.theta)).ravel()
+    across, down, smooth_diagonal, smooth_gradient = _smoothness(theta, image_weights, config, widening)
+    width = theta.shape[1]
+    # dia_array: entry k of the diagonal with offset d belongs to column k
+    bands = np.zeros((5, theta.size), np.float32)
+    bands[0] = diagonal + smooth_diagonal.ravel()
+    bands[1, 1:] = -across.ravel()[:-1]
+    bands[2, :-1] = -across.ravel()[:-1]
+    bands[3, width:] = -down.ravel()[:-width]
+    bands[4, :-width] = -down.ravel()[:-width]
+    matrix = sparse.dia_array((bands, [0, 1, -1, width, -width]), (theta.size, theta.size))
+    return Normal(matrix, gradient + smooth_gradient.ravel(), information)
+
+
+def cost(
+    theta: Float32,
+    edges: Sequence[Edge],
+    others: Mapping[Frame, Float32],
+    image_weights: tuple[Float32, Float32],
+    prior: DepthPrior,
+    config: RefinementConfig,
+) -> float:
+    """The cost whose reweighted form ``normal_equations`` linearises: floors and confidences as there."""
+    inverse_depth = np.exp(theta).ravel()
+    total = 0.0
+    for edge in edges:
+        rho = inverse_depth[edge.pixels]
+        terms = edge.terms(rho)
+        each = np.abs(terms.residual).sum(axis=1)
+        total += config.flow_weight * float(
+            (edge.weight * robust_cost(each, config.flow_lambda))[terms.valid].sum()
+        )
+        there = others.get(edge.j)
+        if there is not None and config.disparity_weight > 0.0:
+            seen = terms.valid & (edge.nearest >= 0)
+            rho_j = np.exp(there.ravel()[edge.nearest[seen]])
+            ratio = ratio_terms(rho[seen], rho_j, terms.depth_ratio[seen], edge.jTi)
+            each = robust_cost(np.abs(ratio.residual), config.disparity_lambda)
+            total += config.disparity_weight * float((edge.weight[seen] * each).sum())
+    scale = config.smoothness_scale
+    for difference, weight in zip(
+        (np.diff(theta, axis=1), np.diff(theta, axis=0)), image_weights, strict=True
+    ):
+        weight = weight[:, :-1] if difference.shape[1] < theta.shape[1] else weight[:-1]
+        total += 0.5 * config.smoothness * float((weight * np.log1p((difference / scale) ** 2)).sum())
+    return total + 0.5 * float((prior.weight * (theta - prior.theta) ** 2).sum())
+
+
+def robust_cost(cost: npt.NDArray[np.floating], scale: float) -> npt.NDArray[np.floating]:
+    """``cost`` with its confidence eliminated: itself up to ``scale``, ``scale (1 + log(cost / scale))``
+    beyond."""
+    return np.where(cost < scale, cost, scale * (1.0 + np.log(np.maximum(cost, scale) / scale)))
+
+
+def smoothness_weights(grey: npt.NDArray[np.floating], contrast: float) -> tuple[Float32, Float32]:
+    """``(h, w)`` each: how far a pixel of ``grey (h, w)`` shares its depth with its right and lower
+    neighbour.
+
+    0 in the last column and row, which have none.
+    """
+    values = grey.astype(np.float32)
+    across, down = np.zeros(values.shape, np.float32), np.zeros(values.shape, np.float32)
+    across[:, :-1] = np.exp(-np.abs(np.diff(values, axis=1)) / np.float32(contrast))
+    down[:-1] = np.exp(-np.abs(np.diff(values, axis=0)) / np.float32(contrast))
+    return across, down
+
+
+def _add_edge(
+    information: Float32,
+    gradient: Float32,
+    edge: Edge,
+    inverse_depth: Float32,
+    theta_there: Float32 | None,
+    config: RefinementConfig,
+) -> None:
+    rho = inverse_depth[edge.pixels]
+    terms = edge.terms(rho)
+    residual = terms.residual
+    slope = terms.by_inverse_depth * rho[:, None]
+    trust = edge.weight * terms.valid * confidence(np.abs(residual).sum(axis=1), config.flow_lambda)
+    weight = reweighted(residual, FLOW_FLOOR_PX)
+    weight *= (np.float32(config.flow_weight) * trust)[:, None]
+    weighted = weight * slope
+    # pixels occur once per edge
+    information[edge.pixels] += np.einsum("nk,nk->n", weighted, slope)
+    gradient[edge.pixels] += np.einsum("nk,nk->n", weighted, residual)
+    if theta_there is not None and config.disparity_weight > 0.0:
+        _add_ratio(information, gradient, edge, rho, terms, theta_there, config)
+
+
+def _add_ratio(
+    information: Float32,
+    gradient: Float32,
+    edge: Edge,
+    rho: Float32,
+    terms: FlowTerms,
+    theta_there: Float32,
+    config: RefinementConfig,
+) -> None:
+    rho_j = np.exp(theta_there.ravel()[edge.nearest])
+    ratio = ratio_terms(rho, rho_j, terms.depth_ratio, edge.jTi)
+    seen = terms.valid & (edge.nearest >= 0)
+    trust = edge.weight * seen * confidence(np.abs(ratio.residual), config.disparity_lambda)
+    weight = np.float32(config.disparity_weight) * trust * reweighted(ratio.residual, RATIO_FLOOR)
+    slope = ratio.by_inverse_depth_i * rho
+    information[edge.pixels] += weight * slope**2
+    gradient[edge.pixels] += weight * slope * ratio.residual
+
+
+def _smoothness(
+    theta: Float32, image_weights: tuple[Float32, Float32], config: RefinementConfig, widening: float
+) -> tuple[Float32, Float32, Float32, Float32]:
+    """Weights ``(h, w)`` to the right and lower neighbours, and their share of the diagonal and gradient."""
+    scale = np.float32(config.smoothness_scale * widening)
+    across, down = (np.float32(config.smoothness / config.smoothness_scale**2) * w for w in image_weights)
+    right, below = np.diff(theta, axis=1), np.diff(theta, axis=0)
+    across[:, :-1] /= 1.0 + (right / scale) ** 2
+    down[:-1] /= 1.0 + (below / scale) ** 2
+    diagonal = across + down
+    diagonal[:, 1:] += across[:, :-1]
+    diagonal[1:] += down[:-1]
+    gradient = np.zeros_like(theta)
+    pull = across[:, :-1] * right
+    gradient[:, :-1] -= pull
+    gradient[:, 1:] += pull
+    pull = down[:-1] * below
+    gradient[:-1] -= pull
+    gradient[1:] += pull
+    return across, down, diagonal, gradient

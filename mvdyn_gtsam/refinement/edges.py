@@ -1,0 +1,105 @@
+"""Flow as the solves use it: where it is trusted, in pixels of the input."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.dense_flow import Float32, pixel_raster
+from mvdyn_gtsam.geometry import invert_pose
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.connections import is_first
+from mvdyn_gtsam.refinement.residuals import FlowTerms, flow_terms
+from mvdyn_gtsam.refinement.views import DenseView
+from mvdyn_gtsam.refinement.workspace import Workspace
+
+Array = npt.NDArray[np.float64]
+
+LEAST_WEIGHT = 0.02
+"""Flow trusted less is left out: it would cost as much time as any."""
+
+
+@dataclass(frozen=True)
+class Edge:
+    """Flow of one frame to another at the ``M`` pixels where it is trusted."""
+
+    i: Frame
+    j: Frame
+    pixels: npt.NDArray[np.int64]
+    """``(M,)`` flat indices in view i."""
+    rays: Float32
+    """``(M, 3)`` with z = 1."""
+    target: Float32
+    """``(M, 2)`` px of the input resolution of camera j."""
+    weight: Float32
+    """``(M,)`` in (0, 1]"""
+    nearest: npt.NDArray[np.int64]
+    """``(M,)`` flat index in view j of the pixel seen; -1 outside."""
+    jTi: Array
+    """``(4, 4)``"""
+    intrinsics_j: Array
+    """``(3, 3)`` at the input resolution."""
+
+    @property
+    def same_instant(self) -> bool:
+        return self.i[1] == self.j[1]
+
+    def terms(self, inverse_depth: Float32) -> FlowTerms:
+        """L_flow at inverse depths ``(M,)``."""
+        return flow_terms(inverse_depth, self.rays, self.jTi, self.intrinsics_j, self.target)
+
+    def without(self, excluded: npt.NDArray[np.bool_]) -> Edge:
+        """The edge without the pixels of view i that ``excluded (N,)`` marks."""
+        kept = ~excluded[self.pixels]
+        return replace(
+            self,
+            pixels=self.pixels[kept],
+            rays=self.rays[kept],
+            target=self.target[kept],
+            weight=self.weight[kept],
+            nearest=self.nearest[kept],
+        )
+
+
+def load_edges(workspace: Workspace, i: Frame, neighbours: Iterable[Frame], wTc: Array) -> list[Edge]:
+    """Edges of a frame to those of ``neighbours`` whose flow was measured; ``wTc (N, T, 4, 4)``."""
+    edges = []
+    for j in neighbours:
+        first = is_first(i, j)
+        if not workspace.has_flow(*((i, j) if first else (j, i))):
+            continue
+        measured = workspace.read_flow(i, j) if first else workspace.read_flow(j, i, backward=True)
+        view_i, view_j = workspace.views[i[0]], workspace.views[j[0]]
+        weight = measured.weight.ravel()
+        pixels = np.flatnonzero(weight >= LEAST_WEIGHT)
+        small = (pixel_raster(view_i.shape) + measured.flow).reshape(-1, 2)[pixels]
+        edges.append(
+            Edge(
+                i=i,
+                j=j,
+                pixels=pixels,
+                rays=view_i.rays[pixels],
+                target=_in_full_pixels(small, view_j),
+                weight=weight[pixels],
+                nearest=_nearest(small, view_j.shape),
+                jTi=invert_pose(wTc[j]) @ wTc[i],
+                intrinsics_j=view_j.camera.intrinsics,
+            )
+        )
+    return edges
+
+
+def _in_full_pixels(small: Float32, view: DenseView) -> Float32:
+    scale = np.array(
+        [view.camera.width / view.shape[1], view.camera.height / view.shape[0]], dtype=np.float32
+    )
+    return (small + np.float32(0.5)) * scale - np.float32(0.5)
+
+
+def _nearest(target: Float32, shape: tuple[int, int]) -> npt.NDArray[np.int64]:
+    col, row = np.rint(target).astype(np.int64).T
+    inside = (col >= 0) & (row >= 0) & (col < shape[1]) & (row < shape[0])
+    return np.where(inside, row * shape[1] + col, -1)

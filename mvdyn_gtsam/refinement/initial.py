@@ -1,0 +1,143 @@
+"""Where the depth solve begins: of several depths per pixel the one that the flow within the camera likes
+best, and for what moves a depth from the views of its instant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.refinement.depth import robust_cost
+from mvdyn_gtsam.refinement.edges import Edge
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+
+Mask = npt.NDArray[np.bool_]
+
+BOX = 5
+"""Side of the square over which costs are averaged before a pixel decides, px of the view."""
+SCORING_EDGES = 6
+"""Edges that judge the candidates, those that see most parallax."""
+SURE_WEIGHT = 0.2
+"""Weight of flow that may say that something moves: on plain walls flow errs."""
+LEAST_PARALLAX_PX = 10.0
+"""Motion of a pixel per unit of log depth below which its triangulated depth is no candidate."""
+
+
+def best_candidate(
+    candidates: Sequence[Float32], edges: Sequence[Edge], config: RefinementConfig, margin: float = 0.2
+) -> Float32:
+    """Inverse depth ``(h, w)``: at each pixel the candidate ``(h, w)`` with the lowest L_flow around it.
+
+    The depths triangulated from single edges are candidates too. The first of ``candidates`` is kept unless
+    another is better by ``margin`` px of the summed cost.
+    """
+    shape = candidates[0].shape
+    judges = sorted(edges, key=lambda edge: -_parallax(edge, candidates[0]))[:SCORING_EDGES]
+    triangulated = [_triangulated(edge, candidates[0]) for edge in judges[: SCORING_EDGES // 2]]
+    best = candidates[0].copy()
+    lowest = _score(best, judges, config, shape)
+    for candidate in [*candidates[1:], *triangulated]:
+        score = _score(candidate, judges, config, shape)
+        better = score < lowest - margin
+        best[better], lowest[better] = candidate[better], score[better]
+    return best
+
+
+def static_residual(inverse_depth: Float32, edges: Sequence[Edge]) -> Float32:
+    """Median residual ``(h, w)`` px of the flow within the camera if nothing moved; NaN where there is
+    none."""
+    rho = inverse_depth.ravel()
+    own = [edge for edge in edges if edge.j[0] == edge.i[0]]
+    table = np.full((len(own), rho.size), np.nan, np.float32)
+    for row, edge in zip(table, own, strict=True):
+        sure = edge.weight >= SURE_WEIGHT
+        residual = edge.terms(rho[edge.pixels]).residual[sure]
+        row[edge.pixels[sure]] = np.hypot(residual[:, 0], residual[:, 1])
+    if not own:
+        return np.full(inverse_depth.shape, np.nan, np.float32)
+    # median without nanmedian's warnings: NaN sort to the end
+    table.sort(axis=0)
+    count = np.isfinite(table).sum(axis=0)
+    middle = np.maximum(count - 1, 0) // 2
+    return np.take_along_axis(table, middle[None], axis=0)[0].reshape(inverse_depth.shape)
+
+
+def moving_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[np.int32]:
+    """Label ``(h, w)`` of the regions where the static model fails, 0 elsewhere; ``residual`` px, NaN:
+    unknown."""
+    fails = cv2.medianBlur((np.nan_to_num(residual) > config.moving_px).astype(np.uint8), 5)
+    side = 2 * round(config.moving_gap * residual.shape[1] / 2) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    closed = cv2.morphologyEx(fails, cv2.MORPH_CLOSE, kernel)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed)
+    result = np.zeros(residual.shape, np.int32)
+    strong = np.nan_to_num(residual) > 2.0 * config.moving_px
+    for label in range(1, count):
+        region = labels == label
+        # small or hardly failing: noise of flow on plain walls, not motion
+        if (
+            stats[label, cv2.CC_STAT_AREA] >= config.moving_area * residual.size
+            and strong[region].mean() > 0.3
+        ):
+            result[region] = label
+    return result
+
+
+def region_depth(instant: Float32, region: Mask, tolerance: float = 0.15) -> tuple[Float32, float]:
+    """Inverse depth of a moving region's pixels, in the order of ``instant[region]``, and the share that
+    agree.
+
+    A thing is about as deep as it is near: pixels whose depth from the same instant is farther than
+    ``tolerance`` (relative) from the commonest of the region take that.
+    """
+    values = np.log(instant[region])
+    edges = np.arange(values.min() - 0.1, values.max() + 0.2, 0.1)
+    histogram = np.histogram(values, edges)[0]
+    around = np.convolve(histogram, np.ones(3), "same")
+    centre = edges[around.argmax()] + 0.05
+    close = np.abs(values - centre) < tolerance
+    commonest = np.median(values[close])
+    result = np.where(np.abs(values - commonest) < tolerance, values, commonest)
+    return np.exp(result).astype(np.float32), float(close.mean())
+
+
+def _parallax(edge: Edge, inverse_depth: Float32) -> float:
+    """Motion over the image per unit of log depth, px, summed over the edge's pixels."""
+    rho = inverse_depth.ravel()[edge.pixels][::16]
+    baseline = np.linalg.norm(edge.jTi[:3, 3]) * edge.intrinsics_j[0, 0]
+    return float((np.minimum(baseline * rho, 100.0) * edge.weight[::16]).sum())
+
+
+def _score(
+    inverse_depth: Float32, edges: Sequence[Edge], config: RefinementConfig, shape: tuple[int, ...]
+) -> Float32:
+    rho = inverse_depth.ravel()
+    total = np.zeros(rho.size, np.float32)
+    for edge in edges:
+        terms = edge.terms(rho[edge.pixels])
+        each = robust_cost(np.abs(terms.residual).sum(axis=1), config.flow_lambda)
+        # behind the camera: as bad as 20 lambdas off
+        worst = config.flow_lambda * (1.0 + np.log(20.0))
+        total[edge.pixels] += edge.weight * np.where(terms.valid, each, worst)
+    return np.asarray(cv2.blur(total.reshape(shape), (BOX, BOX)), np.float32)
+
+
+def _triangulated(edge: Edge, fallback: Float32) -> Float32:
+    """Inverse depth ``(h, w)`` where the edge's flow meets its epipolar line; ``fallback`` without
+    parallax."""
+    intrinsics = edge.intrinsics_j
+    focal = np.array([intrinsics[0, 0], intrinsics[1, 1]], np.float32)
+    seen = (edge.target - intrinsics[:2, 2].astype(np.float32)) / focal
+    turned = edge.rays @ edge.jTi[:3, :3].T.astype(np.float32)
+    translation = edge.jTi[:3, 3].astype(np.float32)
+    constant = turned[:, :2] - seen * turned[:, 2:]
+    slope = translation[:2] - seen * translation[2]
+    squared = (slope**2).sum(axis=1)
+    rho = -(constant * slope).sum(axis=1) / np.maximum(squared, 1e-12)
+    good = (rho > 0.0) & (np.sqrt(squared) * focal[0] * rho > LEAST_PARALLAX_PX)
+    result = fallback.copy()
+    result.ravel()[edge.pixels[good]] = rho[good]
+    return result

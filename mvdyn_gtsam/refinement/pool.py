@@ -1,0 +1,97 @@
+"""Tasks side by side in processes, results in the order of the jobs."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from types import TracebackType
+
+import cv2
+
+from mvdyn_gtsam.errors import ResultError
+from mvdyn_gtsam.refinement.tasks import Context, run_task
+
+_context: Context | None = None
+"""Of a worker process: it serves one refinement and receives its context once."""
+
+
+class TaskPool:
+    """Runs tasks of ``tasks.TASKS``; with one worker in this very process."""
+
+    def __init__(self, context: Context, workers: int) -> None:
+        """``workers`` 0 takes one per processor."""
+        self._context = context
+        self._workers = workers if workers > 0 else len(os.sched_getaffinity(0))
+        self._executor: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> TaskPool:
+        if self._workers > 1:
+            threads = os.environ.get("OPENBLAS_NUM_THREADS")
+            # read when numpy is imported: a worker is one of several
+            os.environ["OPENBLAS_NUM_THREADS"] = "1"
+            try:
+                self._executor = ProcessPoolExecutor(
+                    self._workers, multiprocessing.get_context("spawn"), _receive, (self._context,)
+                )
+                # processes start with the first job; they must see the variable
+                list(self._executor.map(_ready, range(self._workers)))
+            except BrokenProcessPool as error:
+                raise _broken() from error
+            finally:
+                if threads is None:
+                    del os.environ["OPENBLAS_NUM_THREADS"]
+                else:
+                    os.environ["OPENBLAS_NUM_THREADS"] = threads
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
+
+    def map(self, task: str, jobs: Sequence[object]) -> Iterator[object]:
+        """Results of ``task`` for each of ``jobs``, in order. Raises ResultError when a process dies."""
+        if self._executor is None:
+            for job in jobs:
+                yield run_task(self._context, task, job)
+            return
+        # a few jobs ahead of the reader: results are images, and memory must not grow with the video
+        ahead = 4 * self._workers
+        pending = [self._executor.submit(_run, task, job) for job in jobs[:ahead]]
+        try:
+            for index in range(len(jobs)):
+                if index + ahead < len(jobs):
+                    pending.append(self._executor.submit(_run, task, jobs[index + ahead]))
+                yield pending.pop(0).result()
+        except BrokenProcessPool as error:
+            raise _broken() from error
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def _broken() -> ResultError:
+    return ResultError(
+        "a process of the refinement died, for want of memory perhaps; continue with --resume, and"
+        " --set refinement.workers=1 if it happens again (scripts must call reconstruct() under"
+        " `if __name__ == '__main__':`)"
+    )
+
+
+def _receive(context: Context) -> None:
+    global _context  # noqa: PLW0603 - the one way to hand a worker what all its jobs share
+    _context = context
+    cv2.setNumThreads(1)
+
+
+def _ready(_: int) -> None:
+    """Does nothing: makes the processes start."""
+
+
+def _run(task: str, job: object) -> object:
+    assert _context is not None
+    return run_task(_context, task, job)

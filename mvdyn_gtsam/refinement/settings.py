@@ -1,0 +1,105 @@
+"""What steers the dense refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mvdyn_gtsam.errors import ConfigError
+from mvdyn_gtsam.frontend.plane_sweep import SweepConfig
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Stage 2: dense per-pixel refinement. Lengths in px are of the input resolution."""
+
+    stride: int = 2
+    """Depth is solved for every pixel (1) or every second (2), and brought up along the image's edges.
+    Source: choice; 1 takes four times the time and disk."""
+    workers: int = 0
+    """Processes; 0 takes as many as there are processors. The result does not depend on it. Source:
+    choice."""
+    sweep: SweepConfig = field(default_factory=SweepConfig)
+    temporal_offsets: tuple[int, ...] = (2, 4, 8)
+    """Frame distances of dense temporal edges. Source: paper, "Dense correspondence estimation"."""
+    guided_px: float = 16.0
+    """Mean predicted flow beyond which flow within a camera is guided by depth and poses. Source: as
+    tracking.guided_px."""
+    plain_weight: float = 0.05
+    """Weight of flow within a camera that both directions confirm and no texture does. Source: swept."""
+    window: int = 8
+    """Time steps whose depth is solved together, over all cameras. Source: choice; bounds the memory."""
+    overlap: int = 1
+    """Time steps by which windows overlap on each side. Source: choice."""
+    rounds: int = 2
+    """Times phase 2 solves poses, then depth. Source: choice; see experiments/refinement_phases.py."""
+    affine_iterations: int = 5
+    """Gauss-Newton iterations of phase 1. Source: choice."""
+    depth_iterations: int = 5
+    """Gauss-Newton iterations per depth solve, each with new confidences. Source: choice."""
+    pose_iterations: int = 3
+    """Gauss-Newton iterations per pose solve. Source: choice."""
+    phase1: bool = True
+    """Whether scale and offset of every frame are solved first. Source: paper."""
+    phase2: bool = True
+    """Whether per-pixel depth and poses are solved. Source: paper."""
+    joint: bool = False
+    """Solve poses and depth of phase 2 in one system instead of in turn, for the ablation. Source: paper
+    supplement: it degrades the poses."""
+    flow_weight: float = 1.0
+    """``w_f`` of L_flow, per px. Source: choice of unit."""
+    disparity_weight: float = 5.0
+    """``w_d`` of L_disp, per unit of relative depth: 5 makes 1 % of depth cost as much as 0.05 px. Source:
+    choice."""
+    flow_lambda: float = 1.0
+    """``lambda`` of the flow's confidence: residual at which it begins to fall, px. Source: choice."""
+    disparity_lambda: float = 0.05
+    """The same for L_disp, relative depth. Source: choice."""
+    smoothness: float = 2.0
+    """Weight of a change of log depth by ``smoothness_scale`` between neighbours, where the image is flat.
+    Source: choice."""
+    smoothness_scale: float = 0.01
+    """Relative change beyond which it counts as an edge of the depth and costs no more. Source: choice."""
+    edge_contrast: float = 5.0
+    """Grey levels between neighbours at which smoothness has fallen to 1/e. Source: choice."""
+    prior_sigma: float = 0.3
+    """Standard deviation of the log depth that a solve begins with: holds what no edge sees. Source:
+    choice."""
+    prior_rotation_deg: float = 0.02
+    """Standard deviation in L_prior of tracked rotations whose covariance is unknown. Source: as
+    tracking.start_rotation_deg."""
+    prior_translation: float = 0.0005
+    """The same of positions, in median depths. Source: as tracking.start_translation."""
+    smooth_rotation: float = 1e-3
+    """Weight of L_smooth(rot) against L_prior. Source: choice; it pulls on motion itself."""
+    smooth_translation: float = 1e-3
+    """Weight of L_smooth(trans) against L_prior. Source: choice."""
+    moving_px: float = 0.8
+    """Residual of the static model beyond which a pixel may move, px. Source: on the rendered scenes 90 %
+    of the static pixels are below 0.3 to 0.8 px and 90 % of the moving ones above 0.4 to 10 px."""
+    moving_area: float = 0.003
+    """Smallest region that may move, as a share of the image. Source: choice."""
+    moving_gap: float = 0.04
+    """Gaps in a moving region up to this share of the image's width are closed. Source: choice."""
+    moving_agreement: float = 0.2
+    """Share of a moving region whose depth from the same instant must agree before it is believed. Source:
+    choice."""
+    moving_sigma: float = 0.05
+    """Standard deviation of that depth, relative. Source: choice."""
+
+    def __post_init__(self) -> None:
+        for name, low in (
+            ("stride", 1), ("workers", 0), ("window", 1), ("overlap", 0), ("rounds", 1),
+            ("affine_iterations", 1), ("depth_iterations", 1), ("pose_iterations", 1),
+        ):  # fmt: skip
+            if getattr(self, name) < low:
+                raise ConfigError(f"refinement.{name} is {getattr(self, name)}; it must be at least {low}")
+        for name in (
+            "flow_lambda", "disparity_lambda", "smoothness_scale", "edge_contrast", "prior_rotation_deg",
+            "prior_translation",
+        ):  # fmt: skip
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"refinement.{name} is {getattr(self, name)}; it must be above 0")
+        if any(offset < 1 for offset in self.temporal_offsets):
+            raise ConfigError(
+                f"refinement.temporal_offsets is {list(self.temporal_offsets)}; it must hold distances >= 1"
+            )

@@ -1,0 +1,236 @@
+"""The dense refinement from start to end: the paper's "Multiple-view scene consistency refinement".
+
+Plane sweeps propose depth where a network would; phase 1 aligns every frame's depth by scale and offset
+with the poses held fixed; phase 2 solves poses and per-pixel depth in turn. Everything dense lies on disk.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.capture.model import Camera
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, to_grey
+from mvdyn_gtsam.progress import Progress
+from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_pairs
+from mvdyn_gtsam.refinement.pool import TaskPool
+from mvdyn_gtsam.refinement.poses import solve_poses
+from mvdyn_gtsam.refinement.samples import FrameSample, SampleStore
+from mvdyn_gtsam.refinement.scale import solve_scales
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.tasks import FIRST_DEPTH, Context, FinishedFrame, windows
+from mvdyn_gtsam.refinement.views import DenseView
+from mvdyn_gtsam.refinement.workspace import Workspace
+
+logger = logging.getLogger(__name__)
+
+Array = npt.NDArray[np.float64]
+
+BYTES_PER_PIXEL_AND_PAIR = 10.0
+"""Both directions of a flow on disk: two 16-bit numbers and a weight each."""
+BYTES_PER_PIXEL = 34.0
+"""Of a view on disk besides its flow: eight arrays of 32 bits and two of 8."""
+SECONDS_PER_MEGAPIXEL = 0.25
+"""One flow pair on one processor, per million pixels of the input; measured, DIS at half resolution."""
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What tracking hands to the refinement."""
+
+    cameras: tuple[Camera, ...]
+    groups: tuple[tuple[int, ...], ...]
+    """Cameras that share a world frame."""
+    wTc: Array
+    """``(N, T, 4, 4)``"""
+    covariance: Array
+    """``(N, T, 6, 6)`` of the poses, tangent ``[omega, v]``; NaN where unknown."""
+    omega: tuple[Pair, ...]
+    """Connections of the tracking's graph."""
+    read: Callable[[int, int], npt.NDArray[np.uint8]]
+    """Image ``(H, W, 3)`` of a camera and time."""
+    depth: Callable[[int, int], tuple[Float32, Float32]]
+    """Depth and confidence ``(H, W)`` of a camera and time."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What comes out besides the frames."""
+
+    wTc: Array
+    """``(N, T, 4, 4)``"""
+    scale: Array
+    """``(N, T)`` of phase 1."""
+    offset: Array
+    """``(N, T)`` of phase 1, in the unit of the result."""
+    seconds: dict[str, float]
+    """Time per part, of this run."""
+
+
+def required(tracked: Tracked, config: RefinementConfig, workers: int) -> tuple[float, float]:
+    """Bytes of disk the workspace takes, and seconds its flows take, about."""
+    frame_count = tracked.wTc.shape[1]
+    pairs = refinement_pairs(tracked.omega, tracked.groups, frame_count, config.temporal_offsets)
+    pixels = [camera.width * camera.height for camera in tracked.cameras]
+    small = [value / config.stride**2 for value in pixels]
+    disk = sum(BYTES_PER_PIXEL_AND_PAIR * (small[i[0]] + small[j[0]]) / 2 for i, j in pairs)
+    disk += frame_count * sum(BYTES_PER_PIXEL * s + p for s, p in zip(small, pixels, strict=True))
+    seconds = SECONDS_PER_MEGAPIXEL * sum((pixels[i[0]] + pixels[j[0]]) / 2e6 for i, j in pairs)
+    return disk, seconds / max(1, workers)
+
+
+class Refinement:
+    """One refinement; ``run`` does it, ``frames`` hands out its frames, ``remove`` cleans up."""
+
+    def __init__(
+        self,
+        tracked: Tracked,
+        folder: Path,
+        config: RefinementConfig,
+        flow: DenseFlow,
+        flow_config: FlowConfig,
+        progress: Progress,
+    ) -> None:
+        self._tracked, self._config, self._progress = tracked, config, progress
+        views = tuple(DenseView.of(camera, 1.0 / config.stride) for camera in tracked.cameras)
+        self._frame_count = tracked.wTc.shape[1]
+        self._workspace = Workspace(folder, views, self._frame_count)
+        pairs = refinement_pairs(tracked.omega, tracked.groups, self._frame_count, config.temporal_offsets)
+        self._within = [pair for pair in pairs if pair[0][0] == pair[1][0]]
+        self._across = [pair for pair in pairs if pair[0][0] != pair[1][0]]
+        self._context = Context(
+            self._workspace, tracked.groups, neighbours_of(pairs), config, flow, flow_config
+        )
+        self._frames = [
+            (camera, time) for time in range(self._frame_count) for camera in range(len(tracked.cameras))
+        ]
+        self._depth = "aligned"
+        self.seconds: dict[str, float] = {}
+
+    def run(self) -> Refined:
+        """Everything but handing out the frames; what an earlier run finished is not done again."""
+        config = self._config
+        self._workspace.prepare()
+        self._step("images", self._store_images)
+        with TaskPool(self._context, config.workers) as pool:
+            self._pool = pool
+            self._step("sweep", lambda: self._map("sweep", self._frames))
+            self._step("temporal flow", lambda: self._map("temporal flow", self._within))
+            if config.phase1:
+                self._step("phase 1", self._align)
+            if config.phase2:
+                self._step("begin", lambda: self._map("begin", self._frames))
+                self._depth = "begun"
+                self._solve_depth(FIRST_DEPTH)
+                self._step("wide flow", lambda: self._map("wide flow", self._across))
+                for number in range(1, config.rounds + 1):
+                    self._step(f"poses {number}", self._solve_poses)
+                    self._solve_depth(f"depth {number}")
+        scales = self._workspace.read_array("scales")
+        return Refined(self._context.poses(), scales[0], scales[1], self.seconds)
+
+    def frames(self) -> Iterator[FinishedFrame]:
+        """Every frame at the input resolution, in time order."""
+        jobs = [(self._depth, frame) for frame in self._frames]
+        with TaskPool(self._context, self._config.workers) as pool:
+            for done, frame in enumerate(pool.map("finish", jobs)):
+                assert isinstance(frame, FinishedFrame)
+                yield frame
+                self._progress.update("refined depth", done + 1, len(jobs))
+
+    def remove(self) -> None:
+        """Remove the workspace."""
+        self._workspace.remove()
+
+    def _step(self, name: str, work: Callable[[], None]) -> None:
+        """Do ``work`` unless an earlier run finished it."""
+        if name in self._workspace.finished():
+            return
+        began = perf_counter()
+        work()
+        self.seconds[name] = perf_counter() - began
+        self._workspace.finish(name)
+
+    def _map(self, task: str, jobs: Sequence[object]) -> None:
+        for done, _ in enumerate(self._pool.map(task, jobs)):
+            self._progress.update(f"refine: {task}", done + 1, len(jobs))
+
+    def _store_images(self) -> None:
+        workspace, tracked = self._workspace, self._tracked
+        workspace.create("grey", np.uint8, full_size=True)
+        workspace.create("moving", np.uint8)
+        for name in (
+            "tracked", "tracked_confidence", "aligned", "swept", "instant", "prior", "prior_weight", "begun",
+            "information",
+        ):  # fmt: skip
+            workspace.create(name)
+        for done, frame in enumerate(self._frames):
+            view = workspace.views[frame[0]]
+            workspace.write("grey", frame, to_grey(tracked.read(*frame)))
+            depth, confidence = tracked.depth(*frame)
+            inverse = np.asarray(view.shrink(1.0 / _without_holes(depth)), np.float32)
+            trust = np.asarray(view.shrink(np.where(np.isfinite(depth), confidence, 0.0)), np.float32)
+            workspace.write("tracked", frame, inverse)
+            workspace.write("aligned", frame, inverse)
+            workspace.write("tracked_confidence", frame, trust)
+            # until flow says more: what tracking knew, confidence 1/2 at 5 % error
+            workspace.write("information", frame, trust / np.maximum(1.0 - trust, 1e-3) / 0.05**2)
+            self._progress.update("refine: images", done + 1, len(self._frames))
+        workspace.write_array("poses", tracked.wTc)
+        workspace.write_array("tracked_poses", tracked.wTc)
+        ones, zeros = np.ones(tracked.wTc.shape[:2]), np.zeros(tracked.wTc.shape[:2])
+        workspace.write_array("scales", np.stack([ones, zeros]))
+
+    def _sample(self) -> Callable[[], Iterable[FrameSample]]:
+        """Sample every frame once; what is returned reads them back, as often as a solve asks."""
+        store = SampleStore(self._workspace.folder / "samples.pickle")
+        jobs = [(self._depth, frame) for frame in self._frames]
+        store.write(sample for sample in self._pool.map("sample", jobs) if isinstance(sample, FrameSample))
+        return store.read
+
+    def _align(self) -> None:
+        """Phase 1: scale and offset of every frame's depth."""
+        scales = solve_scales(self._sample(), self._context.poses(), self._config)
+        self._workspace.write_array("scales", np.stack([scales.scale, scales.offset]))
+        for frame in self._frames:
+            depth = 1.0 / self._context.image("tracked", frame)
+            moved = scales.scale[frame] * depth + scales.offset[frame]
+            # an offset must not turn the nearest pixels inside out
+            self._workspace.write("aligned", frame, 1.0 / np.maximum(moved, 0.1 * depth))
+
+    def _solve_depth(self, target: str) -> None:
+        """Phase 2, depth: every window from what all windows had before, so that their order does not
+        matter."""
+        jobs = windows(self._depth, target, self._frame_count, self._config.window)
+
+        def solve() -> None:
+            self._workspace.create(target)
+            self._map("window", jobs)
+
+        self._step(target, solve)
+        self._depth = target
+
+    def _solve_poses(self) -> None:
+        """Phase 2, poses."""
+        tracked = self._tracked
+        wTc = solve_poses(
+            self._sample(),
+            self._context.poses(),
+            tracked.wTc,
+            tracked.groups,
+            self._config,
+            prior_covariance=tracked.covariance,
+        )
+        self._workspace.write_array("poses", wTc)
+
+
+def _without_holes(depth: Float32) -> Float32:
+    """``depth`` with NaN replaced by the median of the rest, 1 without any."""
+    known = np.isfinite(depth) & (depth > 0.0)
+    return np.where(known, depth, np.median(depth[known]) if known.any() else 1.0).astype(np.float32)

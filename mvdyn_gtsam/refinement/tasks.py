@@ -1,0 +1,322 @@
+"""The refinement's work on single frames, pairs and windows: what the processes run.
+
+Each task reads the workspace and writes its own part of it, so that the result does not depend on how many
+processes there are, nor on their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.dense_depth import filled
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.connections import Pair
+from mvdyn_gtsam.refinement.depth import DepthPrior, smoothness_weights, solve_frame
+from mvdyn_gtsam.refinement.edges import Edge, load_edges
+from mvdyn_gtsam.refinement.initial import (
+    SURE_WEIGHT,
+    best_candidate,
+    moving_regions,
+    region_depth,
+    static_residual,
+)
+from mvdyn_gtsam.refinement.measurement import measure_pair, sweep_frame
+from mvdyn_gtsam.refinement.samples import FrameSample
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.workspace import Workspace
+
+Array = npt.NDArray[np.float64]
+
+TRUSTED_SIGMA = 0.05
+"""Standard deviation of log depth at which a pixel's depth counts half as its own and half as its
+surroundings'."""
+SAMPLE_SPACING = 16
+"""Distance of the pixels that phase 1 and the poses see, px of the input."""
+FIRST_STEPS = 2
+"""Gauss-Newton steps before it is asked what moves."""
+
+FIRST_DEPTH = "depth 0"
+"""The array of the first depth solve, from flow within cameras; it guides the flow between them."""
+
+STATIC, MOVING, UNEXPLAINED = 0, 1, 2
+"""Of the array ``moving``: nothing moves; it moves and the views of its instant tell its depth; they do
+not."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What every task needs."""
+
+    workspace: Workspace
+    groups: tuple[tuple[int, ...], ...]
+    neighbours: dict[Frame, tuple[Frame, ...]]
+    config: RefinementConfig
+    flow: DenseFlow
+    flow_config: FlowConfig
+
+    def group_of(self, camera: int) -> tuple[int, ...]:
+        return next(group for group in self.groups if camera in group)
+
+    def poses(self) -> Array:
+        """``(N, T, 4, 4)`` as solved last."""
+        return self.workspace.read_array("poses")
+
+    def image(self, name: str, frame: Frame) -> Float32:
+        return np.asarray(self.workspace.read(name, frame), np.float32)
+
+    def edges(self, frame: Frame, wTc: Array, own_camera: bool) -> list[Edge]:
+        """Measured edges of a frame; with ``own_camera`` those within its camera."""
+        wanted = [j for j in self.neighbours.get(frame, ()) if not own_camera or j[0] == frame[0]]
+        return load_edges(self.workspace, frame, wanted, wTc)
+
+
+def sweep_task(context: Context, frame: Frame) -> None:
+    """Depth of a frame by plane sweep, static and of its instant."""
+    group = context.group_of(frame[0])
+    swept = sweep_frame(context.workspace, frame, group, context.poses(), context.config.sweep)
+    context.workspace.write("swept", frame, swept.inverse_depth)
+    context.workspace.write("instant", frame, swept.instant)
+
+
+def temporal_flow_task(context: Context, pair: Pair) -> None:
+    """Flow within a camera, guided by the tracked depth where it is long."""
+    _measure(context, pair, "tracked")
+
+
+def wide_flow_task(context: Context, pair: Pair) -> None:
+    """Flow between cameras, guided by the depth solved so far."""
+    _measure(context, pair, FIRST_DEPTH)
+
+
+def _measure(context: Context, pair: Pair, guide: str) -> None:
+    i, j = pair
+    if context.workspace.has_flow(i, j):
+        return
+    config = context.config
+    measured = measure_pair(
+        context.workspace, i, j, context.poses(), context.flow, context.flow_config, config, guide
+    )
+    context.workspace.write_flow(i, j, measured)
+
+
+def begin_task(context: Context, frame: Frame) -> None:
+    """The depth that phase 2 begins with, what moves, and the prior."""
+    workspace, config = context.workspace, context.config
+    edges = context.edges(frame, context.poses(), own_camera=True)
+    weights = _image_weights(context, frame)
+    aligned = context.image("aligned", frame)
+    chosen = best_candidate([aligned, context.image("swept", frame)], edges, config)
+    weak = DepthPrior(np.log(chosen), np.full(chosen.shape, config.prior_sigma**-2, np.float32))
+    theta, information = solve_frame(np.log(chosen), edges, {}, weights, weak, config, FIRST_STEPS)
+    labels = moving_regions(static_residual(np.exp(theta), edges), config)
+    trust = information / np.float32(TRUSTED_SIGMA**-2) / (1.0 + information / np.float32(TRUSTED_SIGMA**-2))
+    trust[labels > 0] = 0.0
+    # depth of what moves must not leak into the plain wall behind it
+    # what is plain mostly stands behind: an average of depth cubed leans to the far side
+    cubed = filled(np.exp(-3.0 * theta).astype(np.float32), trust)
+    theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
+    moving = np.where(labels > 0, UNEXPLAINED, STATIC).astype(np.uint8)
+    instant = context.image("instant", frame)
+    for label in np.unique(labels[labels > 0]) if len(context.group_of(frame[0])) > 1 else ():
+        region = labels == label
+        depth, agreement = region_depth(instant, region)
+        if agreement > config.moving_agreement:
+            theta[region] = np.log(depth)
+            moving[region] = MOVING
+    weight = np.maximum(trust, 1e-3) / np.float32(config.prior_sigma**2)
+    weight[moving == MOVING] = config.moving_sigma**-2
+    workspace.write("prior", frame, theta)
+    workspace.write("prior_weight", frame, weight)
+    workspace.write("moving", frame, moving)
+    workspace.write("begun", frame, np.exp(theta))
+
+
+def window_task(context: Context, window: tuple[str, str, int, int]) -> None:
+    """Depth of all cameras between two times: ``(read from, write to, first, end)`` arrays and times.
+
+    Frames up to ``overlap`` steps outside are solved too, so that the window's ends see renewed neighbours,
+    but are not kept: another window does.
+    """
+    source, target, first, end = window
+    workspace, config = context.workspace, context.config
+    wTc = context.poses()
+    times = range(max(0, first - config.overlap), min(workspace.frame_count, end + config.overlap))
+    renewed: dict[Frame, Float32] = {}
+    for group in context.groups:
+        for frame in ((camera, time) for time in times for camera in group):
+            moves = workspace.read("moving", frame) != STATIC
+            edges = context.edges(frame, wTc, own_camera=False)
+            edges = [edge if edge.same_instant else edge.without(moves.ravel()) for edge in edges]
+            others = {
+                edge.j: renewed[edge.j] if edge.j in renewed else np.log(context.image(source, edge.j))
+                for edge in edges
+            }
+            prior = DepthPrior(context.image("prior", frame), context.image("prior_weight", frame))
+            theta, information = solve_frame(
+                np.log(context.image(source, frame)),
+                edges,
+                others,
+                _image_weights(context, frame),
+                prior,
+                config,
+                config.depth_iterations,
+            )
+            renewed[frame] = theta
+            if first <= frame[1] < end:
+                workspace.write(target, frame, np.exp(theta))
+                workspace.write("information", frame, information)
+
+
+def sample_task(context: Context, job: tuple[str, Frame]) -> FrameSample:
+    """A frame's pixels on a coarse raster, with depth of the array named first and flow to all neighbours."""
+    depth_name, frame = job
+    workspace, wTc = context.workspace, context.poses()
+    view = workspace.views[frame[0]]
+    step = max(1, round(SAMPLE_SPACING * view.shape[1] / view.camera.width))
+    raster = np.arange(view.shape[0] * view.shape[1]).reshape(view.shape)
+    pixels = raster[step // 2 :: step, step // 2 :: step].ravel()
+    row_of = np.full(view.shape[0] * view.shape[1], -1)
+    row_of[pixels] = np.arange(len(pixels))
+    moves = (workspace.read("moving", frame) != STATIC).ravel()
+    edges = context.edges(frame, wTc, own_camera=False)
+    count = len(edges)
+    target = np.zeros((count, len(pixels), 2))
+    weight = np.zeros((count, len(pixels)))
+    there = np.full((count, len(pixels)), np.nan)
+    for k, edge in enumerate(edges):
+        if not edge.same_instant:
+            edge = edge.without(moves)
+        rows = row_of[edge.pixels]
+        here = rows >= 0
+        target[k, rows[here]] = edge.target[here]
+        weight[k, rows[here]] = edge.weight[here]
+        seen = here & (edge.nearest >= 0)
+        there[k, rows[seen]] = context.image(depth_name, edge.j).ravel()[edge.nearest[seen]]
+    return FrameSample(
+        i=frame,
+        neighbours=tuple(edge.j for edge in edges),
+        rays=view.rays[pixels].astype(np.float64),
+        inverse_depth=context.image(depth_name, frame).ravel()[pixels].astype(np.float64),
+        intrinsics=np.array([edge.intrinsics_j for edge in edges]).reshape(count, 3, 3),
+        target=target,
+        weight=weight,
+        inverse_depth_there=there,
+    )
+
+
+@dataclass(frozen=True)
+class FinishedFrame:
+    """A frame at the input resolution."""
+
+    frame: Frame
+    depth: Float32
+    """``(H, W)``"""
+    confidence: Float32
+    """``(H, W)`` in [0, 1]"""
+    moving: npt.NDArray[np.uint8]
+    """``(H, W)`` 255 where it moves: the static model fails and the views of the instant agree on a depth;
+    128 where it fails and they do not."""
+    before_px: dict[int, float]
+    """Median residual of the flow to each camera with the tracked depth and poses; no entry without flow."""
+    after_px: dict[int, float]
+    """The same with those of the refinement."""
+
+
+def finish_task(context: Context, job: tuple[str, Frame]) -> FinishedFrame:
+    """Depth, confidence and motion mask of a frame from the array named first."""
+    name, frame = job
+    view = context.workspace.views[frame[0]]
+    information = context.image("information", frame)
+    # as in tracking: confidence falls to a half at 5 % error
+    confidence = information / (information + np.float32(TRUSTED_SIGMA**-2))
+    moving = np.asarray(context.workspace.read("moving", frame))
+    confidence[moving == MOVING] = np.maximum(confidence, 0.5)[moving == MOVING]
+    confidence[moving == UNEXPLAINED] = 0.0
+    grey = np.asarray(context.workspace.read("grey", frame), np.uint8)
+    size = (view.camera.width, view.camera.height)
+    mask = np.array([0, 255, 128], np.uint8)[moving]
+    inverse_depth = context.image(name, frame)
+    edges = context.edges(frame, context.poses(), own_camera=False)
+    tracked_wTc = context.workspace.read_array("tracked_poses")
+    before = context.edges(frame, tracked_wTc, own_camera=False)
+    return FinishedFrame(
+        frame=frame,
+        depth=1.0 / upsample(inverse_depth, grey, context.config.edge_contrast),
+        confidence=view.grow(confidence),
+        moving=np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)),
+        before_px=_median_residuals(before, context.image("tracked", frame)),
+        after_px=_median_residuals(edges, inverse_depth),
+    )
+
+
+def _median_residuals(edges: Sequence[Edge], inverse_depth: Float32) -> dict[int, float]:
+    """By camera that the edges lead to."""
+    residuals: dict[int, list[Float32]] = {}
+    for edge in edges:
+        sure = edge.weight >= SURE_WEIGHT
+        residual = edge.terms(inverse_depth.ravel()[edge.pixels]).residual[sure]
+        residuals.setdefault(edge.j[0], []).append(np.hypot(residual[:, 0], residual[:, 1]))
+    return {
+        camera: float(np.median(np.concatenate(values)))
+        for camera, values in residuals.items()
+        if sum(map(len, values)) > 0
+    }
+
+
+def upsample(inverse_depth: Float32, grey: npt.NDArray[np.uint8], contrast: float) -> Float32:
+    """``(H, W)`` of ``(h, w)``: a pixel takes the four around it by nearness and likeness of luminance.
+
+    Joint bilateral upsampling (https://dl.acm.org/doi/10.1145/1276377.1276497) of log depth.
+    """
+    height, width = grey.shape
+    if inverse_depth.shape == grey.shape:
+        return inverse_depth
+    luminance = cv2.GaussianBlur(grey, (0, 0), 0.7).astype(np.float32)
+    small = cv2.resize(luminance, inverse_depth.shape[::-1], interpolation=cv2.INTER_AREA)
+    theta = np.log(inverse_depth)
+    rows = (np.arange(height, dtype=np.float32) + 0.5) * inverse_depth.shape[0] / height - 0.5
+    cols = (np.arange(width, dtype=np.float32) + 0.5) * inverse_depth.shape[1] / width - 0.5
+    total, value = np.zeros_like(luminance), np.zeros_like(luminance)
+    top, left = np.floor(rows), np.floor(cols)
+    for row, near_row in ((top, 1.0 - (rows - top)), (top + 1, rows - top)):
+        for col, near_col in ((left, 1.0 - (cols - left)), (left + 1, cols - left)):
+            y = np.clip(row, 0, inverse_depth.shape[0] - 1).astype(int)
+            x = np.clip(col, 0, inverse_depth.shape[1] - 1).astype(int)
+            unlike = (luminance - small[y[:, None], x]) / np.float32(contrast)
+            share = (near_row[:, None] * near_col) * (np.exp(-(unlike**2)) + np.float32(1e-3))
+            total += share
+            value += share * theta[y[:, None], x]
+    return np.exp(value / total).astype(np.float32)
+
+
+def _image_weights(context: Context, frame: Frame) -> tuple[Float32, Float32]:
+    grey = np.asarray(context.workspace.read("grey", frame), np.uint8)
+    small = context.workspace.views[frame[0]].shrink(cv2.GaussianBlur(grey, (0, 0), 1.0))
+    return smoothness_weights(np.asarray(small, np.float32), context.config.edge_contrast)
+
+
+def run_task(context: Context, task: str, job: object) -> object:
+    """One task by name: functions travel to other processes as names."""
+    return TASKS[task](context, job)  # type: ignore[operator]
+
+
+TASKS = {
+    "sweep": sweep_task,
+    "temporal flow": temporal_flow_task,
+    "wide flow": wide_flow_task,
+    "begin": begin_task,
+    "window": window_task,
+    "sample": sample_task,
+    "finish": finish_task,
+}
+
+
+def windows(source: str, target: str, frame_count: int, length: int) -> Sequence[tuple[str, str, int, int]]:
+    """Jobs of ``window_task`` that cover all times."""
+    return [(source, target, t, min(t + length, frame_count)) for t in range(0, frame_count, length)]

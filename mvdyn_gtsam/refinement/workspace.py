@@ -1,0 +1,147 @@
+"""The refinement's dense state on disk: memory holds a window of frames, whatever the length of the video.
+
+Everything lies in one folder that goes when the refinement is done. A journal says which steps are
+finished, so that a killed run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.errors import ResultError
+from mvdyn_gtsam.frontend.dense_flow import Float32, FlowPair
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.views import DenseView
+
+JOURNAL = "journal.json"
+STEPS_PER_PX = 64
+"""Flow is kept as 16-bit integers of 1/64 px where it fits: float16 would round a flow of 300 px to 0.25
+px."""
+
+
+@dataclass(frozen=True)
+class DirectedFlow:
+    """Flow of one frame to another, in the views' pixels."""
+
+    i: Frame
+    j: Frame
+    flow: Float32
+    """``(h_i, w_i, 2)``"""
+    weight: Float32
+    """``(h_i, w_i)`` in [0, 1]"""
+
+
+class Workspace:
+    """Files of one refinement; opened anew by every worker process."""
+
+    def __init__(self, folder: Path, views: tuple[DenseView, ...], frame_count: int) -> None:
+        self.folder, self.views, self.frame_count = folder, views, frame_count
+
+    def prepare(self) -> None:
+        """Make the folder. Raises ResultError when that fails."""
+        try:
+            (self.folder / "flow").mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ResultError(f"{self.folder}: cannot be made ({error.strerror})") from error
+
+    def remove(self) -> None:
+        """Remove everything."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def finished(self) -> list[str]:
+        """Names of the finished steps."""
+        path = self.folder / JOURNAL
+        return [str(step) for step in json.loads(path.read_text())] if path.is_file() else []
+
+    def finish(self, step: str) -> None:
+        """Note a step as finished."""
+        temporary = self.folder / f".{JOURNAL}.part"
+        temporary.write_text(json.dumps([*self.finished(), step]))
+        temporary.replace(self.folder / JOURNAL)
+
+    def create(self, name: str, dtype: type = np.float32, full_size: bool = False) -> None:
+        """Make an array per camera, one image per frame, filled with zeros."""
+        for camera, view in enumerate(self.views):
+            shape = (view.camera.height, view.camera.width) if full_size else view.shape
+            path = self._path(name, camera)
+            if not path.is_file():
+                array = np.lib.format.open_memmap(
+                    path, mode="w+", dtype=dtype, shape=(self.frame_count, *shape)
+                )
+                array.flush()
+
+    def read(self, name: str, frame: Frame) -> npt.NDArray[np.generic]:
+        """One image of an array."""
+        camera, time = frame
+        return np.array(np.load(self._path(name, camera), mmap_mode="r")[time])
+
+    def write(self, name: str, frame: Frame, image: npt.NDArray[np.generic]) -> None:
+        """Set one image of an array."""
+        camera, time = frame
+        np.load(self._path(name, camera), mmap_mode="r+")[time] = image
+
+    def write_array(self, name: str, array: npt.NDArray[np.float64]) -> None:
+        """Keep one array of its own, such as the poses; the old one stays until the new one is whole."""
+        temporary = self.folder / f".{name}.part.npy"
+        np.save(temporary, array)
+        temporary.replace(self.folder / f"{name}.npy")
+
+    def read_array(self, name: str) -> npt.NDArray[np.float64]:
+        """What ``write_array`` kept."""
+        return np.asarray(np.load(self.folder / f"{name}.npy"))
+
+    def _path(self, name: str, camera: int) -> Path:
+        return self.folder / f"{name}_{camera}.npy"
+
+    def has_flow(self, i: Frame, j: Frame) -> bool:
+        """Whether the pair was measured, in this order."""
+        return self._flow_path(i, j).is_file()
+
+    def write_flow(self, i: Frame, j: Frame, pair: FlowPair) -> None:
+        """Keep both directions of a pair measured on full images, averaged down to the views."""
+        arrays = {}
+        for name, frame, other, flow, weight in (
+            ("forward", i, j, pair.forward, pair.forward_weight),
+            ("backward", j, i, pair.backward, pair.backward_weight),
+        ):
+            small, trust = self._shrunk(frame, other, flow, weight)
+            steps = min(float(STEPS_PER_PX), 32000.0 / max(1.0, float(np.abs(small).max())))
+            arrays[name] = np.rint(small * np.float32(steps)).astype(np.int16)
+            arrays[f"{name}_weight"] = np.rint(trust * 255.0).astype(np.uint8)
+            arrays[f"{name}_steps"] = np.array(steps)
+        path = self._flow_path(i, j)
+        temporary = path.with_name(f".{path.name}.part.npz")
+        np.savez(temporary, **arrays)
+        temporary.replace(path)
+
+    def read_flow(self, i: Frame, j: Frame, backward: bool = False) -> DirectedFlow:
+        """One direction of a measured pair: i to j, or with ``backward`` j to i."""
+        name = "backward" if backward else "forward"
+        with np.load(self._flow_path(i, j)) as arrays:
+            flow = arrays[name].astype(np.float32) / np.float32(arrays[f"{name}_steps"])
+            weight = arrays[f"{name}_weight"].astype(np.float32) / np.float32(255.0)
+        return DirectedFlow(j, i, flow, weight) if backward else DirectedFlow(i, j, flow, weight)
+
+    def _shrunk(self, i: Frame, j: Frame, flow: Float32, weight: Float32) -> tuple[Float32, Float32]:
+        """Flow in the pixels of view j at the pixels of view i, and its weight."""
+        view_i, view_j = self.views[i[0]], self.views[j[0]]
+        small = np.asarray(view_i.shrink(flow), np.float32)
+        trust = np.asarray(view_i.shrink(weight), np.float32)
+        height, width = view_i.shape
+        # x_i + f in full pixels, each resized by its own camera's scale: x' = (x + 0.5) s - 0.5
+        own = np.array([view_i.camera.width / width, view_i.camera.height / height], np.float32)
+        other = np.array(
+            [view_j.shape[1] / view_j.camera.width, view_j.shape[0] / view_j.camera.height], np.float32
+        )
+        raster = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+        full = (raster + np.float32(0.5)) * own - np.float32(0.5) + small
+        return (full + np.float32(0.5)) * other - np.float32(0.5) - raster, trust
+
+    def _flow_path(self, i: Frame, j: Frame) -> Path:
+        return self.folder / "flow" / f"{i[0]}_{i[1]:06d}_{j[0]}_{j[1]:06d}.npz"
