@@ -29,6 +29,9 @@ FLOW_FLOOR_PX = 0.1
 """Residuals below are noise of the flow: their absolute value is taken for its square."""
 RATIO_FLOOR = 0.005
 """The same for the ratio of depths."""
+WIDEST_KERNEL = 8.0
+"""Smoothness scales of the first step's kernel at most: beyond, it would join all depths whatever the flow
+says, and the narrow kernel would not find back."""
 SOLVER_TOLERANCE = 0.02
 """Relative residual at which conjugate gradients end; the next step corrects what is left."""
 SOLVER_STEPS = 80
@@ -74,7 +77,7 @@ def solve_frame(
     information = np.zeros_like(theta)
     for iteration in range(iterations):
         # depth edges are found coarse to fine: a wide kernel first
-        widening = 2.0 ** max(0, iterations - 2 - iteration)
+        widening = min(WIDEST_KERNEL, 2.0 ** max(0, iterations - 2 - iteration))
         normal = normal_equations(theta, edges, others, image_weights, prior, config, widening)
         preconditioner = sparse.dia_array((1.0 / normal.matrix.diagonal()[None], [0]), normal.matrix.shape)
         step, _ = cg(
@@ -95,11 +98,15 @@ def normal_equations(
     widening: float = 1.0,
 ) -> Normal:
     """The reweighted cost at ``theta (h, w)`` to second order; arguments as for ``solve_frame``."""
-    information, gradient = np.zeros(theta.size, np.float32), np.zeros(theta.size, np.float32)
+    information, agreement, gradient = (np.zeros(theta.size, np.float32) for _ in range(3))
     inverse_depth = np.exp(theta).ravel()
     for edge in edges:
-        _add_edge(information, gradient, edge, inverse_depth, others.get(edge.j), config)
-    diagonal = information + prior.weight.ravel()
+        terms = edge.terms(inverse_depth[edge.pixels])
+        _add_flow(information, gradient, edge, inverse_depth, terms, config)
+        theta_there = others.get(edge.j)
+        if theta_there is not None and config.disparity_weight > 0.0:
+            _add_ratio(agreement, gradient, edge, inverse_depth, terms, theta_there, config)
+    diagonal = information + agreement + prior.weight.ravel()
     gradient += (prior.weight * (theta - prior.theta)).ravel()
     across, down, smooth_diagonal, smooth_gradient = _smoothness(theta, image_weights, config, widening)
     width = theta.shape[1]
@@ -167,18 +174,16 @@ def smoothness_weights(grey: npt.NDArray[np.floating], contrast: float) -> tuple
     return across, down
 
 
-def _add_edge(
+def _add_flow(
     information: Float32,
     gradient: Float32,
     edge: Edge,
     inverse_depth: Float32,
-    theta_there: Float32 | None,
+    terms: FlowTerms,
     config: RefinementConfig,
 ) -> None:
-    rho = inverse_depth[edge.pixels]
-    terms = edge.terms(rho)
     residual = terms.residual
-    slope = terms.by_inverse_depth * rho[:, None]
+    slope = terms.by_inverse_depth * inverse_depth[edge.pixels, None]
     trust = edge.weight * terms.valid * confidence(np.abs(residual).sum(axis=1), config.flow_lambda)
     weight = reweighted(residual, FLOW_FLOOR_PX)
     weight *= (np.float32(config.flow_weight) * trust)[:, None]
@@ -186,31 +191,32 @@ def _add_edge(
     # pixels occur once per edge
     information[edge.pixels] += np.einsum("nk,nk->n", weighted, slope)
     gradient[edge.pixels] += np.einsum("nk,nk->n", weighted, residual)
-    if theta_there is not None and config.disparity_weight > 0.0:
-        _add_ratio(information, gradient, edge, rho, terms, theta_there, config)
 
 
 def _add_ratio(
-    information: Float32,
+    agreement: Float32,
     gradient: Float32,
     edge: Edge,
-    rho: Float32,
+    inverse_depth: Float32,
     terms: FlowTerms,
     theta_there: Float32,
     config: RefinementConfig,
 ) -> None:
-    rho_j = np.exp(theta_there.ravel()[edge.nearest])
+    rho, rho_j = inverse_depth[edge.pixels], np.exp(theta_there.ravel()[edge.nearest])
     ratio = ratio_terms(rho, rho_j, terms.depth_ratio, edge.jTi)
     seen = terms.valid & (edge.nearest >= 0)
     trust = edge.weight * seen * confidence(np.abs(ratio.residual), config.disparity_lambda)
     weight = np.float32(config.disparity_weight) * trust * reweighted(ratio.residual, RATIO_FLOOR)
     slope = ratio.by_inverse_depth_i * rho
-    information[edge.pixels] += weight * slope**2
+    agreement[edge.pixels] += weight * slope**2
     gradient[edge.pixels] += weight * slope * ratio.residual
 
 
 def _smoothness(
-    theta: Float32, image_weights: tuple[Float32, Float32], config: RefinementConfig, widening: float
+    theta: Float32,
+    image_weights: tuple[Float32, Float32],
+    config: RefinementConfig,
+    widening: float,
 ) -> tuple[Float32, Float32, Float32, Float32]:
     """Weights ``(h, w)`` to the right and lower neighbours, and their share of the diagonal and gradient."""
     scale = np.float32(config.smoothness_scale * widening)
