@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from pathlib import Path
 from time import perf_counter
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import Config, to_dict
+from mvdyn_gtsam.errors import ResultError
 from mvdyn_gtsam.frontend.dense_depth import upsample_depth
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, DisFlow
 from mvdyn_gtsam.frontend.dense_map import testimony_flow
@@ -17,10 +19,14 @@ from mvdyn_gtsam.frontend.start import Start, start_from_arrays, start_to_arrays
 from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer, WideBaselineInitializer
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction import CaptureInfo, Reconstruction, ReconstructionWriter
+from mvdyn_gtsam.refinement.report import SelfCheck
+from mvdyn_gtsam.refinement.stage import Refinement, Tracked, required
 from mvdyn_gtsam.tracking.model import FrameDepth, TrackingResult
 from mvdyn_gtsam.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)
+
+STAGES = ("tracking", "refinement")
 
 
 def reconstruct(
@@ -28,7 +34,7 @@ def reconstruct(
     out: Path | str,
     config: Config | None = None,
     *,
-    stage: str = "tracking",
+    stage: str = "refinement",
     resume: bool = False,
     progress: Progress | None = None,
     flow: DenseFlow | None = None,
@@ -36,12 +42,13 @@ def reconstruct(
 ) -> Reconstruction:
     """Recover every camera's pose and depth at every frame and write them to ``out``.
 
-    ``stage`` is the last one to run; "tracking" is the only one so far. ``flow`` and ``initializer`` replace
-    the classical measurements. With ``resume`` what ``out`` already holds is not computed again. Raises
-    TrackingError when nothing can be reconstructed, ResultError when ``out`` cannot be used.
+    ``stage`` is the last one to run, one of ``STAGES``. ``flow`` and ``initializer`` replace the classical
+    measurements; a flow that cannot be pickled needs ``refinement.workers=1``. With ``resume`` what ``out``
+    already holds is not computed again. Raises TrackingError when nothing can be reconstructed, ResultError
+    when ``out`` cannot be used.
     """
-    if stage != "tracking":
-        raise ValueError(f"unknown stage {stage!r}; this version has tracking")
+    if stage not in STAGES:
+        raise ValueError(f"unknown stage {stage!r}; there are {', '.join(STAGES)}")
     config = config if config is not None else Config()
     progress = progress if progress is not None else NullProgress()
     flow = flow if flow is not None else DisFlow(config.frontend.flow)
@@ -58,6 +65,8 @@ def reconstruct(
             writer.set_groups([[capture.cameras[camera].name for camera in group] for group in start.groups])
             _note_groups(capture, start, writer)
             _track(capture, start, flow, config, writer, progress)
+        if stage == "refinement" and not writer.stage_finished("refinement"):
+            _refine(capture, flow, config, writer, progress)
     return Reconstruction.load(out)
 
 
@@ -118,6 +127,65 @@ def _track(
     writer.finish_stage("tracking", perf_counter() - began)
 
 
+def _refine(
+    capture: Capture, flow: DenseFlow, config: Config, writer: ReconstructionWriter, progress: Progress
+) -> None:
+    """Dense depth and poses from flow of every pixel; they replace tracking's when all is done."""
+    began = perf_counter()
+    tracked = _tracked(capture, writer)
+    refinement = Refinement(
+        tracked, writer.refinement_folder / "work", config.refinement, flow, config.frontend.flow, progress
+    )
+    _announce_refinement(tracked, config, writer)
+    refined = refinement.run()
+    names = [camera.name for camera in capture.cameras]
+    residuals = SelfCheck(names)
+    for frame in refinement.frames():
+        camera, time = frame.frame
+        residuals.add(frame)
+        writer.write_refined(names[camera], time, frame.depth, frame.confidence, frame.moving)
+    for camera, name in enumerate(names):
+        writer.write_refined_trajectory(name, capture.timestamps, refined.wTc[camera])
+    writer.publish_refined()
+    writer.set_diagnostics("residual_px", residuals.medians())
+    writer.set_diagnostics("refinement_seconds", refined.seconds)
+    writer.write_arrays("scales", {"scale": refined.scale, "offset": refined.offset})
+    writer.finish_stage("refinement", perf_counter() - began)
+    refinement.remove()
+    shutil.rmtree(writer.refinement_folder, ignore_errors=True)
+
+
+def _announce_refinement(tracked: Tracked, config: Config, writer: ReconstructionWriter) -> None:
+    """Say what it takes, and refuse what the disk cannot hold."""
+    disk, seconds = required(tracked, config.refinement)
+    free = shutil.disk_usage(writer.folder).free
+    logger.info("refinement: %.0f MB of disk while it works, flow takes about %.0f s", disk / 1e6, seconds)
+    if free < disk:
+        raise ResultError(
+            f"{writer.folder}: the refinement works on {disk / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB"
+            " left; free space, then continue with --resume, or stay with --stage tracking"
+        )
+
+
+def _tracked(capture: Capture, writer: ReconstructionWriter) -> Tracked:
+    """The tracking result as it lies on disk."""
+    result = Reconstruction.load(writer.tracked())
+    names = [camera.name for camera in capture.cameras]
+    connections = writer.read_arrays("connections")["frames"]
+    return Tracked(
+        cameras=capture.cameras,
+        groups=tuple(tuple(names.index(name) for name in group) for group in result.groups),
+        wTc=np.stack([result.trajectory(name)[1] for name in names]),
+        covariance=writer.read_arrays("covariance")["covariance"],
+        omega=tuple(((int(a), int(b)), (int(c), int(d))) for a, b, c, d in connections),
+        read=capture.read,
+        depth=lambda camera, time: (
+            result.depth(names[camera], time),
+            result.confidence(names[camera], time),
+        ),
+    )
+
+
 def _write_depth(
     capture: Capture, depth: FrameDepth, result: TrackingResult, writer: ReconstructionWriter
 ) -> None:
@@ -136,6 +204,9 @@ def _write_depth(
 def _write_diagnostics(capture: Capture, result: TrackingResult, writer: ReconstructionWriter) -> None:
     names = [camera.name for camera in capture.cameras]
     writer.write_arrays("covariance", {"covariance": result.covariance})
+    writer.write_arrays(
+        "connections", {"frames": np.array([(*edge.i, *edge.j) for edge in result.edges]).reshape(-1, 4)}
+    )
     writer.set_diagnostics("seconds", dict(result.seconds))
     writer.set_diagnostics(
         "keyframes", {name: list(times) for name, times in zip(names, result.keyframe_times, strict=True)}

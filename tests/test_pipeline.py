@@ -20,12 +20,14 @@ from mvdyn_gtsam.capture import load_capture
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import Config, load_config
 from mvdyn_gtsam.demo import demo_capture
-from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowPair
+from mvdyn_gtsam.errors import ResultError
+from mvdyn_gtsam.frontend.dense_flow import DisFlow, Float32, Image
 from mvdyn_gtsam.frontend.start import Start
 from mvdyn_gtsam.geometry import invert_pose, rotation_angle_deg
 from mvdyn_gtsam.pipeline import reconstruct
 from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.reconstruction import Reconstruction
+from mvdyn_gtsam.refinement.tasks import TASKS
 from tests.tracking.synthetic_scene import Scene, two_cameras
 
 SMALL = (
@@ -33,7 +35,10 @@ SMALL = (
     "tracking.keyframe_px=0.5",
     "graph.long_range_separation=6",
     "frontend.wide_baseline.features=1000",
+    "refinement.workers=1",
+    "refinement.sweep.levels=40",
 )
+ALL_STAGES = ["start", "tracking", "refinement"]
 
 
 def config() -> Config:
@@ -56,17 +61,17 @@ class StoppedError(Exception):
 
 
 class FlowThatStops(DisFlow):
-    """Measures ``count`` times, then ends the run."""
+    """Measures ``count`` directions, then ends the run."""
 
     def __init__(self, count: int) -> None:
         super().__init__()
         self.left = count
 
-    def measure(self, *arguments: Any, **options: Any) -> FlowPair:
+    def flow(self, grey_i: Image, grey_j: Image) -> Float32:
         self.left -= 1
         if self.left < 0:
             raise StoppedError
-        return super().measure(*arguments, **options)
+        return super().flow(grey_i, grey_j)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +121,7 @@ def test_every_frame_gets_a_pose_and_a_depth(result: Reconstruction, scene: Scen
 
 
 def test_the_manifest_tells_what_was_done(result: Reconstruction) -> None:
-    assert list(stages(result.folder)) == ["start", "tracking"]
+    assert list(stages(result.folder)) == ALL_STAGES
     assert result.manifest["status"] == "complete"
     assert result.manifest["groups"] == [["cam0", "cam1"]]
     assert result.manifest["unit"] == "arbitrary"
@@ -142,7 +147,7 @@ def test_a_stopped_run_continues_without_a_new_start(
 ) -> None:
     again = GivenStart(start.start)
     with pytest.raises(StoppedError):
-        reconstruct(scene.capture(), tmp_path, config(), initializer=again, flow=FlowThatStops(8))
+        reconstruct(scene.capture(), tmp_path, config(), initializer=again, flow=FlowThatStops(16))
     assert list(stages(tmp_path)) == ["start"]
     stopped = Reconstruction.load(tmp_path)
     assert stopped.manifest["status"] == "failed"
@@ -152,7 +157,7 @@ def test_a_stopped_run_continues_without_a_new_start(
     finished = reconstruct(scene.capture(), tmp_path, config(), initializer=again, resume=True)
     assert again.calls == 1
     assert finished.manifest["status"] == "complete"
-    assert list(stages(tmp_path)) == ["start", "tracking"]
+    assert list(stages(tmp_path)) == ALL_STAGES
     np.testing.assert_allclose(all_poses(finished), all_poses(result), atol=1e-9, rtol=0)
 
 
@@ -166,6 +171,70 @@ def test_resuming_what_is_finished_computes_nothing(
     )
     assert asked.calls == 0 and start.calls == before[1]
     np.testing.assert_array_equal(all_poses(again), all_poses(result))
+
+
+def test_the_tracking_is_kept_beside_the_refinement(result: Reconstruction, scene: Scene) -> None:
+    tracked = result.tracked()
+    assert tracked.stages == ["start", "tracking"]
+    assert_right(tracked, scene, position=0.01, rotation=0.1)
+    # what was refined is another depth, and nothing is left of the work
+    assert not np.array_equal(tracked.depth("cam0", 2), result.depth("cam0", 2))
+    assert not (result.folder / "refinement").exists()
+    with pytest.raises(ResultError, match="--stage refinement"):
+        tracked.motion("cam0", 2)
+
+
+def test_the_refinement_fits_the_flow_better_and_finds_no_motion_in_a_static_scene(
+    result: Reconstruction,
+) -> None:
+    for pair in result.diagnostics("residual_px"):
+        assert pair["after_px"] <= 1.05 * pair["before_px"], pair
+    assert max((result.motion(name, 3) > 0).mean() for name in result.cameras) < 0.02
+
+
+def depth_error(result: Reconstruction, scene: Scene) -> float:
+    """Relative error that a tenth of all depths exceed, after one scale for all: where surfaces end."""
+    ratios = [
+        (result.depth(name, number) / truth).ravel()
+        for camera, name in enumerate(result.cameras)
+        for number, truth in enumerate(scene.depths[camera])
+    ]
+    ratio = np.concatenate(ratios)
+    return float(np.nanquantile(np.abs(ratio / np.nanmedian(ratio) - 1.0), 0.9))
+
+
+def test_the_refinement_improves_the_depth(result: Reconstruction, scene: Scene) -> None:
+    assert depth_error(result, scene) < 0.95 * depth_error(result.tracked(), scene)
+
+
+def test_a_refinement_stopped_half_way_leaves_the_tracking_and_continues(
+    result: Reconstruction, scene: Scene, start: GivenStart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise StoppedError
+
+    monkeypatch.setitem(TASKS, "wide flow", stop)
+    with pytest.raises(StoppedError):
+        reconstruct(scene.capture(), tmp_path, config(), initializer=start)
+    assert list(stages(tmp_path)) == ["start", "tracking"]
+    stopped = Reconstruction.load(tmp_path)
+    np.testing.assert_array_equal(stopped.depth("cam1", 4), result.tracked().depth("cam1", 4))
+    monkeypatch.undo()
+    # what was done is not done again
+    monkeypatch.setitem(TASKS, "sweep", stop)
+    finished = reconstruct(scene.capture(), tmp_path, config(), initializer=start, resume=True)
+    assert list(stages(tmp_path)) == ALL_STAGES
+    np.testing.assert_allclose(all_poses(finished), all_poses(result), atol=1e-9, rtol=0)
+    np.testing.assert_allclose(finished.depth("cam1", 4), result.depth("cam1", 4), rtol=1e-6)
+
+
+def test_processes_change_nothing(
+    result: Reconstruction, scene: Scene, start: GivenStart, tmp_path: Path
+) -> None:
+    two = load_config(None, [*SMALL, "refinement.workers=2"])
+    other = reconstruct(scene.capture(), tmp_path / "out", two, initializer=start)
+    np.testing.assert_array_equal(other.depth("cam0", 3), result.depth("cam0", 3))
+    np.testing.assert_array_equal(all_poses(other), all_poses(result))
 
 
 def test_cameras_that_nothing_connects_are_said_to_be_apart(tmp_path: Path) -> None:

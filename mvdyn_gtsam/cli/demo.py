@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mvdyn_gtsam.cli.reconstruct import BUILT_STAGES, reconstruct_with_progress, summary
+from mvdyn_gtsam.cli.reconstruct import STAGES, reconstruct_with_progress, summary
 from mvdyn_gtsam.errors import EvaluationError, ResultError
 
 SUMMARY = "reconstruct the bundled clip, score it, and say where to look"
@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
         capture,
         arguments.out,
         Config(),
-        stage=BUILT_STAGES[-1],
+        stage=STAGES[-1],
         resume=False,
         overwrite=True,
         messages=messages,

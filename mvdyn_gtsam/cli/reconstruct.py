@@ -12,7 +12,7 @@ from rich.console import Console
 
 from mvdyn_gtsam.cli.arguments import add_capture_arguments, add_config_arguments, read_capture, read_config
 from mvdyn_gtsam.cli.progress import ConsoleProgress
-from mvdyn_gtsam.errors import ConfigError, ResultError
+from mvdyn_gtsam.errors import ResultError
 
 if TYPE_CHECKING:
     from mvdyn_gtsam.capture import Capture
@@ -29,10 +29,11 @@ examples:
   mvdyn reconstruct clip --out result
   mvdyn reconstruct --camera a.mp4 --intrinsics 800,800,639.5,359.5 \\
                     --camera b.mp4 --intrinsics 810,810,639.5,359.5 --out result
+  mvdyn reconstruct clip --out result --stage tracking         # poses and rough depth, in half the time
+  mvdyn reconstruct clip --out result --resume                # refine it later
   mvdyn reconstruct clip --out result --set tracking.window=20"""
 
 STAGES = ("tracking", "refinement")
-BUILT_STAGES = ("tracking",)
 BYTES_PER_PIXEL = 1.0
 """Depth and confidence on disk, measured 0.9 on noisy depth."""
 
@@ -42,7 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_capture_arguments(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder of the result")
     parser.add_argument(
-        "--stage", choices=STAGES, default=BUILT_STAGES[-1], help="last stage to run (default: %(default)s)"
+        "--stage",
+        choices=STAGES,
+        default=STAGES[-1],
+        help="last stage to run: poses and rough depth only, or dense depth too (default: %(default)s)",
     )
     add_config_arguments(parser)
     again = parser.add_mutually_exclusive_group()
@@ -54,8 +58,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, messages: Console) -> int:
     """Run the verb."""
-    if arguments.stage not in BUILT_STAGES:
-        raise ConfigError(f"--stage {arguments.stage} is not available in this version; use --stage tracking")
     from mvdyn_gtsam.reconstruction import refuse_unusable
 
     config = read_config(arguments)

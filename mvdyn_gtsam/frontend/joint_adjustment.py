@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -17,12 +18,17 @@ from factors.priors import pose_prior
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.features import Features
+from mvdyn_gtsam.frontend.rig import Pair, RigConfig, add_mounts, likely_mounts, solved_mounts
 from mvdyn_gtsam.frontend.single_camera import CameraMap
 from mvdyn_gtsam.frontend.start import StartFrame
 from mvdyn_gtsam.geometry import Similarity, invert_pose, project, transform_points
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+Label = tuple[int, int]
+"""Camera and row of one of its map's frames."""
+
+logger = logging.getLogger(__name__)
 
 ROBUST_PX = 1.0
 """Cauchy scale of reprojection errors; SIFT is good to about half a pixel."""
@@ -44,6 +50,7 @@ class AdjustmentConfig:
     """Levenberg-Marquardt iterations per round. Source: choice, time."""
     relative_tolerance: float = 1e-3
     """Relative decrease of the cost at which a round ends. Source: choice, time."""
+    rig: RigConfig = field(default_factory=RigConfig)
 
     def __post_init__(self) -> None:
         if self.maximum_iterations < 1 or self.relative_tolerance <= 0.0:
@@ -87,10 +94,13 @@ def adjust_maps(
         for camera, similarity in wSm.items()
         for frame, pose in enumerate(similarity.transform_poses(maps[camera].mTc))
     }
-    wTc, observations = _optimise(cameras, wTc, observations, config)
+    times = {(camera, frame): int(maps[camera].times[frame]) for camera, frame in wTc}
+    wTc, observations, mounts = _optimise(cameras, times, wTc, observations, {}, config)
     for radius in config.search_px:
         found = _search(cameras, maps, wTc, observations, radius, config.similarity)
-        wTc, observations = _optimise(cameras, wTc, found, config)
+        wTc, observations, mounts = _optimise(cameras, times, wTc, found, mounts, config)
+    for a, b in mounts:
+        logger.info("%s and %s are mounted on one another", cameras[a].name, cameras[b].name)
     return {
         camera: tuple(
             _start_frame(camera, frame, maps[camera], wTc[camera, frame], observations)
@@ -103,7 +113,7 @@ def adjust_maps(
 def _search(
     cameras: Sequence[Camera],
     maps: Sequence[CameraMap],
-    wTc: Mapping[tuple[int, int], Array],
+    wTc: Mapping[Label, Array],
     observations: Observations,
     radius: float,
     similarity: float,
@@ -237,11 +247,40 @@ def _choose_points(landmark: Index, camera: Index, count: int, per_camera: int) 
 
 def _optimise(
     cameras: Sequence[Camera],
-    wTc: Mapping[tuple[int, int], Array],
+    times: Mapping[Label, int],
+    wTc: Mapping[Label, Array],
     observations: Observations,
+    mounts: Mapping[Pair, Array],
     config: AdjustmentConfig,
-) -> tuple[dict[tuple[int, int], Array], Observations]:
-    """Bundle adjustment with a redescending loss; sightings that do not fit afterwards are dropped."""
+) -> tuple[dict[Label, Array], Observations, dict[Pair, Array]]:
+    """Bundle adjustment with a redescending loss; sightings that do not fit afterwards are dropped.
+
+    ``mounts`` are held. Where there are none yet, cameras that move like a rig are tried as one, and their
+    mounts returned if the images bear it out.
+    """
+    sightings, values, landmark_key = _sightings(cameras, wTc, observations)
+    graph = gtsam.NonlinearFactorGraph(sightings)
+    _fix_gauge(graph, wTc, observations, landmark_key)
+    solution = _solve(graph, values, times, mounts, config)
+    mounts = solved_mounts(solution, mounts)
+    if not mounts:
+        poses = {(label[0], times[label]): solution.atPose3(X(*label)).matrix() for label in wTc}
+        likely = likely_mounts(poses, config.rig)
+        if likely:
+            held = _solve(graph, solution, times, likely, config)
+            increase = sightings.error(held) / max(sightings.error(solution), 1e-12) - 1.0
+            logger.debug("holding %s as mounted: cost %+.1f %%", list(likely), 100.0 * increase)
+            if increase <= config.rig.cost_increase:
+                solution, mounts = held, solved_mounts(held, likely)
+    solved = {label: solution.atPose3(X(*label)).matrix() for label in wTc}
+    points = np.array([solution.atPoint3(key) for key in landmark_key]).reshape(-1, 3)
+    return solved, _fitting(cameras, solved, replace(observations, points=points)), mounts
+
+
+def _sightings(
+    cameras: Sequence[Camera], wTc: Mapping[Label, Array], observations: Observations
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[int]]:
+    """Reprojection factors, the values to begin with, and the keys of the landmarks."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for (camera, frame), pose in wTc.items():
         values.insert(X(camera, frame), gtsam.Pose3(pose))
@@ -264,18 +303,28 @@ def _optimise(
                 pixel, noise, X(camera, frame), landmark_key[landmark], calibrations[camera], False, False
             )
         )
-    _fix_gauge(graph, wTc, observations, landmark_key)
+    return graph, values, landmark_key
+
+
+def _solve(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    times: Mapping[Label, int],
+    mounts: Mapping[Pair, Array],
+    config: AdjustmentConfig,
+) -> gtsam.Values:
+    """Levenberg-Marquardt with ``mounts`` held; ``graph`` and ``values`` stay as they are."""
+    if mounts:
+        graph, values = gtsam.NonlinearFactorGraph(graph), gtsam.Values(values)
+        add_mounts(graph, values, mounts, [((label[0], time), X(*label)) for label, time in times.items()])
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(config.maximum_iterations)
     parameters.setRelativeErrorTol(config.relative_tolerance)
-    solution = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    solved = {label: solution.atPose3(X(*label)).matrix() for label in wTc}
-    points = np.array([solution.atPoint3(key) for key in landmark_key]).reshape(-1, 3)
-    return solved, _fitting(cameras, solved, replace(observations, points=points))
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
 
 
 def _fitting(
-    cameras: Sequence[Camera], wTc: Mapping[tuple[int, int], Array], observations: Observations
+    cameras: Sequence[Camera], wTc: Mapping[Label, Array], observations: Observations
 ) -> Observations:
     error = np.full(len(observations.landmark), np.inf)
     for (camera, frame), pose in wTc.items():
@@ -301,7 +350,7 @@ def _fitting(
 
 def _fix_gauge(
     graph: gtsam.NonlinearFactorGraph,
-    wTc: Mapping[tuple[int, int], Array],
+    wTc: Mapping[Label, Array],
     observations: Observations,
     landmark_key: list[int],
 ) -> None:

@@ -39,7 +39,7 @@ class SweepConfig:
     """Image noise, grey levels: patches with less contrast than this say nothing. Source: choice."""
     unseen: float = 0.3
     """What a depth gets from a view that would not see it: more than from one that contradicts. Source:
-    swept."""
+    compared."""
     temporal_offsets: tuple[int, ...] = (8, 16)
     """Distances in frames, both ways, of the other views of the same camera. Source: choice."""
     temporal_weight: float = 0.75
@@ -54,9 +54,10 @@ class SweepConfig:
     """Cost of a change by one level between neighbours. Source: compared."""
     large_step: float = 4.0
     """Cost of any larger change where the image is flat; falls towards ``small_step`` at edges. Source:
-    swept."""
+    compared."""
     edge_contrast: float = 20.0
-    """Grey levels between neighbours at which the cost of a large change has fallen to 1/e. Source: compared."""
+    """Grey levels between neighbours at which the cost of a large change has fallen to 1/e. Source:
+    compared."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.scale <= 1.0:

@@ -61,6 +61,19 @@ def decode_confidence(png: bytes) -> npt.NDArray[np.float32] | None:
     return values.astype(np.float32) / np.float32(255.0)
 
 
+def encode_mask(mask: npt.NDArray[np.uint8]) -> bytes:
+    """PNG bytes of a mask ``(H, W) uint8``, values as they are."""
+    return _encode_png(np.asarray(mask, dtype=np.uint8))
+
+
+def decode_mask(png: bytes) -> npt.NDArray[np.uint8] | None:
+    """Mask ``(H, W) uint8``; None when the bytes are not such a PNG."""
+    values = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) if png else None
+    if values is None or values.dtype != np.uint8 or values.ndim != 2:
+        return None
+    return np.asarray(values)
+
+
 def _encode_png(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> bytes:
     done, buffer = cv2.imencode(".png", image, _PNG_OPTIONS)
     if not done:

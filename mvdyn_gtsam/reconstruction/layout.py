@@ -28,3 +28,18 @@ def arrays_path(folder: Path, name: str) -> Path:
 def diagnostics_path(folder: Path, name: str) -> Path:
     """Optional JSON diagnostics, e.g. edge counts."""
     return folder / "diagnostics" / f"{name}.json"
+
+
+def motion_path(folder: Path, camera: str, time: int) -> Path:
+    """Motion mask of one frame, once refined."""
+    return folder / "motion" / camera / f"{time:06d}.png"
+
+
+def tracked_folder(folder: Path) -> Path:
+    """What tracking said, as a reconstruction of its own, once a refined one has taken its place."""
+    return folder / "tracking"
+
+
+def refinement_folder(folder: Path) -> Path:
+    """Where a refinement works until it is done."""
+    return folder / "refinement"

@@ -5,23 +5,27 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import ResultError
-from mvdyn_gtsam.reconstruction.encoding import decode_confidence, decode_depth
+from mvdyn_gtsam.reconstruction.encoding import decode_confidence, decode_depth, decode_mask
 from mvdyn_gtsam.reconstruction.files import read_tum
 from mvdyn_gtsam.reconstruction.layout import (
     arrays_path,
     confidence_path,
     depth_path,
     diagnostics_path,
+    motion_path,
+    tracked_folder,
     trajectory_path,
 )
 from mvdyn_gtsam.reconstruction.manifest import cameras_of, read_manifest
+
+Pixel = TypeVar("Pixel", np.float32, np.uint8)
 
 
 class Reconstruction:
@@ -130,6 +134,25 @@ class Reconstruction:
         path = confidence_path(self.folder, name, time)
         return self._checked(path, name, decode_confidence(self._read(path, name, time)))
 
+    def motion(self, name: str, time: int) -> npt.NDArray[np.uint8]:
+        """Motion mask ``(H, W) uint8`` of frame ``time``, once refined.
+
+        255: it moves, and the views of its instant agree on its depth; 128: it moves and they do not, or
+        none sees it; 0: it stands still.
+        """
+        path = motion_path(self.folder, name, time)
+        if "refinement" not in self.stages:
+            raise ResultError(
+                f"{path}: motion is found by the refinement; run it with: mvdyn reconstruct --resume"
+                " --stage refinement"
+            )
+        return self._checked(path, name, decode_mask(self._read(path, name, time)))
+
+    def tracked(self) -> Reconstruction:
+        """What tracking said before the refinement; this very reconstruction where there was none."""
+        kept = tracked_folder(self.folder)
+        return Reconstruction.load(kept) if "refinement" in self.stages else self
+
     def arrays(self, name: str) -> dict[str, npt.NDArray[Any]]:
         """Arrays of ``diagnostics/<name>.npz``, e.g. marginal covariances of the keyframes."""
         path = arrays_path(self.folder, name)
@@ -169,9 +192,7 @@ class Reconstruction:
         except OSError as error:
             raise ResultError(f"{path}: cannot be read ({error.strerror})") from error
 
-    def _checked(
-        self, path: Path, name: str, image: npt.NDArray[np.float32] | None
-    ) -> npt.NDArray[np.float32]:
+    def _checked(self, path: Path, name: str, image: npt.NDArray[Pixel] | None) -> npt.NDArray[Pixel]:
         camera = self.camera(name)
         if image is None or image.shape != (camera.height, camera.width):
             raise ResultError(f"{path}: damaged; delete it and continue with mvdyn reconstruct --resume")

@@ -14,9 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.errors import ResultError
-from mvdyn_gtsam.reconstruction.encoding import encode_confidence, encode_depth
+from mvdyn_gtsam.reconstruction.encoding import encode_confidence, encode_depth, encode_mask
 from mvdyn_gtsam.reconstruction.files import format_tum, write_atomically, write_json
-from mvdyn_gtsam.reconstruction.layout import arrays_path, confidence_path, depth_path, trajectory_path
+from mvdyn_gtsam.reconstruction.layout import (
+    arrays_path,
+    confidence_path,
+    depth_path,
+    motion_path,
+    refinement_folder,
+    tracked_folder,
+    trajectory_path,
+)
 from mvdyn_gtsam.reconstruction.manifest import (
     MANIFEST_NAME,
     CaptureInfo,
@@ -28,7 +36,12 @@ from mvdyn_gtsam.reconstruction.manifest import (
 
 log = logging.getLogger(__name__)
 
-_OUR_FOLDERS = ("trajectories", "depth", "confidence", "diagnostics", "exports", "pictures")
+_OUR_FOLDERS = (
+    "trajectories", "depth", "confidence", "motion", "diagnostics", "exports", "pictures", "tracking",
+    "refinement",
+)  # fmt: skip
+_REPLACED = ("trajectories", "depth", "confidence")
+"""What a refinement writes anew; tracking's go to a folder of their own."""
 
 
 class ReconstructionWriter:
@@ -94,12 +107,21 @@ class ReconstructionWriter:
         self, camera: str, timestamps: npt.NDArray[np.float64], wTc: npt.NDArray[np.float64]
     ) -> None:
         """Write poses ``wTc`` ``(T, 4, 4)`` at ``timestamps`` ``(T,)`` s, one per frame; NaN = no pose."""
+        self._write_trajectory(self.folder, camera, timestamps, wTc)
+
+    def _write_trajectory(
+        self,
+        folder: Path,
+        camera: str,
+        timestamps: npt.NDArray[np.float64],
+        wTc: npt.NDArray[np.float64],
+    ) -> None:
         self._check_camera(camera)
         if wTc.shape != (self._frame_count, 4, 4) or timestamps.shape != (self._frame_count,):
             raise ValueError(
                 f"{camera}: poses {wTc.shape}, timestamps {timestamps.shape} for {self._frame_count} frames"
             )
-        write_atomically(trajectory_path(self.folder, camera), format_tum(timestamps, wTc).encode())
+        write_atomically(trajectory_path(folder, camera), format_tum(timestamps, wTc).encode())
 
     def write_depth(
         self,
@@ -109,6 +131,16 @@ class ReconstructionWriter:
         confidence: npt.NDArray[np.floating],
     ) -> None:
         """Write depth ``(H, W)`` (NaN = invalid) and confidence ``(H, W)`` in [0, 1] of frame ``time``."""
+        self._write_depth(self.folder, camera, time, depth, confidence)
+
+    def _write_depth(
+        self,
+        folder: Path,
+        camera: str,
+        time: int,
+        depth: npt.NDArray[np.floating],
+        confidence: npt.NDArray[np.floating],
+    ) -> None:
         self._check_frame(camera, time)
         if depth.shape != self._sizes[camera] or confidence.shape != self._sizes[camera]:
             raise ValueError(
@@ -120,13 +152,75 @@ class ReconstructionWriter:
                 "%s frame %d: %d depths outside the storable range are invalid", camera, time, dropped
             )
         # Depth last: its presence says that both files of the frame are there.
-        write_atomically(confidence_path(self.folder, camera, time), encode_confidence(confidence))
-        write_atomically(depth_path(self.folder, camera, time), content)
+        write_atomically(confidence_path(folder, camera, time), encode_confidence(confidence))
+        write_atomically(depth_path(folder, camera, time), content)
 
     def has_depth(self, camera: str, time: int) -> bool:
         """Whether depth and confidence of that frame are on disk."""
         self._check_frame(camera, time)
         return depth_path(self.folder, camera, time).is_file()
+
+    @property
+    def refinement_folder(self) -> Path:
+        """Where a refinement keeps its state until ``publish_refined``."""
+        return refinement_folder(self.folder)
+
+    def write_refined(
+        self,
+        camera: str,
+        time: int,
+        depth: npt.NDArray[np.floating],
+        confidence: npt.NDArray[np.floating],
+        moving: npt.NDArray[np.uint8],
+    ) -> None:
+        """As ``write_depth``, with a motion mask ``(H, W)``; seen by readers after ``publish_refined``."""
+        self._check_frame(camera, time)
+        write_atomically(motion_path(self._refined, camera, time), encode_mask(moving))
+        self._write_depth(self._refined, camera, time, depth, confidence)
+
+    def write_refined_trajectory(
+        self, camera: str, timestamps: npt.NDArray[np.float64], wTc: npt.NDArray[np.float64]
+    ) -> None:
+        """As ``write_trajectory``; seen by readers after ``publish_refined``."""
+        self._write_trajectory(self._refined, camera, timestamps, wTc)
+
+    def publish_refined(self) -> None:
+        """Let the refined frames and poses take the place of tracking's, which move to ``tracking/``.
+
+        ``tracking/`` is a reconstruction of its own, to compare with. May be called again when it was
+        interrupted. Raises ResultError when a folder cannot be moved.
+        """
+        kept = tracked_folder(self.folder)
+        stages = [stage for stage in self._manifest["stages"] if stage["name"] != "refinement"]
+        write_json(
+            kept / MANIFEST_NAME, {**self._manifest, "stages": stages, "status": Status.COMPLETE.value}
+        )
+        try:
+            for name in _REPLACED:
+                if not (self._refined / name).is_dir():
+                    continue  # moved before the interruption
+                if not (kept / name).is_dir():
+                    (self.folder / name).rename(kept / name)
+                if (self.folder / name).is_dir():
+                    shutil.rmtree(self.folder / name)
+                (self._refined / name).rename(self.folder / name)
+            if (self._refined / "motion").is_dir():
+                shutil.rmtree(self.folder / "motion", ignore_errors=True)
+                (self._refined / "motion").rename(self.folder / "motion")
+        except OSError as error:
+            raise ResultError(
+                f"{self.folder}: refined frames cannot be put in place ({error.strerror}); nothing is lost:"
+                " continue with --resume"
+            ) from error
+
+    @property
+    def _refined(self) -> Path:
+        return self.refinement_folder / "result"
+
+    def tracked(self) -> Path:
+        """Folder of the tracking's trajectories and depth: this one, or ``tracking/`` once refined."""
+        kept = tracked_folder(self.folder)
+        return kept if all((kept / name).is_dir() for name in _REPLACED) else self.folder
 
     def write_arrays(self, name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         """Write ``diagnostics/<name>.npz`` (e.g. covariances); read with ``Reconstruction.arrays``."""

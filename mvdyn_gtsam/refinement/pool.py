@@ -24,7 +24,7 @@ class TaskPool:
     def __init__(self, context: Context, workers: int) -> None:
         """``workers`` 0 takes one per processor."""
         self._context = context
-        self._workers = workers if workers > 0 else len(os.sched_getaffinity(0))
+        self._workers = worker_count(workers)
         self._executor: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> TaskPool:
@@ -72,6 +72,14 @@ class TaskPool:
         finally:
             for future in pending:
                 future.cancel()
+
+
+def worker_count(workers: int) -> int:
+    """Processes that a setting means: 0 is one per processor of this process."""
+    if workers > 0:
+        return workers
+    # not everywhere: macOS has no affinity
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _broken() -> ResultError:

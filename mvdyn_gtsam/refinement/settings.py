@@ -18,20 +18,19 @@ class RefinementConfig:
     workers: int = 0
     """Processes; 0 takes as many as there are processors. The result does not depend on it. Source:
     choice."""
-    sweep: SweepConfig = field(default_factory=SweepConfig)
     temporal_offsets: tuple[int, ...] = (2, 4, 8)
     """Frame distances of dense temporal edges. Source: paper, "Dense correspondence estimation"."""
     guided_px: float = 16.0
     """Mean predicted flow beyond which flow within a camera is guided by depth and poses. Source: as
     tracking.guided_px."""
     plain_weight: float = 0.05
-    """Weight of flow within a camera that both directions confirm and no texture does. Source: swept."""
+    """Weight of flow within a camera that both directions confirm and no texture does. Source: choice."""
     window: int = 8
     """Time steps whose depth is solved together, over all cameras. Source: choice; bounds the memory."""
     overlap: int = 1
     """Time steps by which windows overlap on each side. Source: choice."""
-    rounds: int = 2
-    """Times phase 2 solves poses, then depth. Source: choice; see experiments/refinement_phases.py."""
+    rounds: int = 1
+    """Times phase 2 solves poses, then depth, after a first depth. Source: choice, time."""
     affine_iterations: int = 5
     """Gauss-Newton iterations of phase 1. Source: choice."""
     depth_iterations: int = 5
@@ -85,6 +84,7 @@ class RefinementConfig:
     choice."""
     moving_sigma: float = 0.05
     """Standard deviation of that depth, relative. Source: choice."""
+    sweep: SweepConfig = field(default_factory=SweepConfig)
 
     def __post_init__(self) -> None:
         for name, low in (

@@ -19,7 +19,7 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, to_grey
 from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_pairs
-from mvdyn_gtsam.refinement.pool import TaskPool
+from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
 from mvdyn_gtsam.refinement.poses import solve_poses
 from mvdyn_gtsam.refinement.samples import FrameSample, SampleStore
 from mvdyn_gtsam.refinement.scale import solve_scales
@@ -73,7 +73,7 @@ class Refined:
     """Time per part, of this run."""
 
 
-def required(tracked: Tracked, config: RefinementConfig, workers: int) -> tuple[float, float]:
+def required(tracked: Tracked, config: RefinementConfig) -> tuple[float, float]:
     """Bytes of disk the workspace takes, and seconds its flows take, about."""
     frame_count = tracked.wTc.shape[1]
     pairs = refinement_pairs(tracked.omega, tracked.groups, frame_count, config.temporal_offsets)
@@ -82,7 +82,7 @@ def required(tracked: Tracked, config: RefinementConfig, workers: int) -> tuple[
     disk = sum(BYTES_PER_PIXEL_AND_PAIR * (small[i[0]] + small[j[0]]) / 2 for i, j in pairs)
     disk += frame_count * sum(BYTES_PER_PIXEL * s + p for s, p in zip(small, pixels, strict=True))
     seconds = SECONDS_PER_MEGAPIXEL * sum((pixels[i[0]] + pixels[j[0]]) / 2e6 for i, j in pairs)
-    return disk, seconds / max(1, workers)
+    return disk, seconds / worker_count(config.workers)
 
 
 class Refinement:
@@ -116,7 +116,7 @@ class Refinement:
     def run(self) -> Refined:
         """Everything but handing out the frames; what an earlier run finished is not done again."""
         config = self._config
-        self._workspace.prepare()
+        self._workspace.prepare(repr((config, self._context.flow_config)))
         self._step("images", self._store_images)
         with TaskPool(self._context, config.workers) as pool:
             self._pool = pool

@@ -158,14 +158,9 @@ def window_task(context: Context, window: tuple[str, str, int, int]) -> None:
                 for edge in edges
             }
             prior = DepthPrior(context.image("prior", frame), context.image("prior_weight", frame))
+            theta, weights = np.log(context.image(source, frame)), _image_weights(context, frame)
             theta, information = solve_frame(
-                np.log(context.image(source, frame)),
-                edges,
-                others,
-                _image_weights(context, frame),
-                prior,
-                config,
-                config.depth_iterations,
+                theta, edges, others, weights, prior, config, config.depth_iterations
             )
             renewed[frame] = theta
             if first <= frame[1] < end:

@@ -43,10 +43,17 @@ class Workspace:
     def __init__(self, folder: Path, views: tuple[DenseView, ...], frame_count: int) -> None:
         self.folder, self.views, self.frame_count = folder, views, frame_count
 
-    def prepare(self) -> None:
-        """Make the folder. Raises ResultError when that fails."""
+    def prepare(self, settings: str) -> None:
+        """Make the folder, or keep what an earlier run with the same ``settings`` left in it.
+
+        Raises ResultError when that fails.
+        """
+        path = self.folder / "settings.txt"
         try:
+            if not path.is_file() or path.read_text() != settings:
+                self.remove()
             (self.folder / "flow").mkdir(parents=True, exist_ok=True)
+            path.write_text(settings)
         except OSError as error:
             raise ResultError(f"{self.folder}: cannot be made ({error.strerror})") from error
 

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from types import MappingProxyType
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
-from factors.keys import S, X
+from factors.keys import M, S, X
 from factors.measurement import StructurelessMeasurement
 from factors.projection import reproject
 from mvdyn_gtsam.config import TrackingConfig
+from mvdyn_gtsam.frontend.rig import Pair, RigConfig, add_mounts, likely_mounts, solved_mounts
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.tracking.keyframe_factor import keyframe_factor
 from mvdyn_gtsam.tracking.model import Keyframe, View, measurement_of
 from mvdyn_gtsam.tracking.window import Priors, solve_depth, useful_neighbours
 
 logger = logging.getLogger(__name__)
+
+Mounts = Mapping[Pair, npt.NDArray[np.float64]]
+"""Relative poses ``aTb`` of cameras mounted on one another."""
+NO_MOUNTS: Mounts = MappingProxyType({})
 
 SHORT_RUN = 3
 """Levenberg-Marquardt iterations between two searches along the way."""
@@ -53,13 +59,15 @@ def solve_all(
     priors: Priors,
     thin: bool = False,
     robust_px: float | None = None,
+    mounts: Mounts = NO_MOUNTS,
 ) -> PolishSolve:
     """Levenberg-Marquardt over poses and depth scales of all ``keyframes``; they are updated in place.
 
-    ``thin`` uses every second grid point: enough between two rounds of measuring.
+    ``thin`` uses every second grid point: enough between two rounds of measuring. ``mounts`` are held, their
+    relative poses being solved for.
     """
     frames = {keyframe.frame: keyframe for keyframe in keyframes}
-    graph, values = build_graph(keyframes, views, config, priors, thin, robust_px)
+    graph, values = build_graph(keyframes, views, config, priors, thin, robust_px, mounts)
     before = graph.error(values)
     result, after, iterations = _minimise(graph, values, before, config)
     for keyframe in keyframes:
@@ -148,10 +156,14 @@ def _weighted_median(values: npt.NDArray[np.float64], weight: npt.NDArray[np.flo
 
 
 def marginal_covariances(
-    keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig, priors: Priors
+    keyframes: list[Keyframe],
+    views: tuple[View, ...],
+    config: TrackingConfig,
+    priors: Priors,
+    mounts: Mounts = NO_MOUNTS,
 ) -> dict[Frame, npt.NDArray[np.float64]]:
     """``(6, 6)`` covariance of every keyframe's pose, tangent ``[omega, v]``."""
-    graph, values = build_graph(keyframes, views, config, priors)
+    graph, values = build_graph(keyframes, views, config, priors, mounts=mounts)
     if 7 * len(keyframes) > LARGEST_INVERSE:
         marginals = gtsam.Marginals(graph, values)
         return {keyframe.frame: marginals.marginalCovariance(X(*keyframe.frame)) for keyframe in keyframes}
@@ -159,6 +171,8 @@ def marginal_covariances(
     for keyframe in keyframes:
         ordering.push_back(X(*keyframe.frame))
         ordering.push_back(S(*keyframe.frame))
+    for pair in mounts:
+        ordering.push_back(M(*pair))
     information, _ = graph.linearize(values).hessian(ordering)
     # unit diagonal: the gauge is held a million times as firmly as the rest
     scale = 1.0 / np.sqrt(np.diagonal(information))
@@ -176,8 +190,9 @@ def build_graph(
     priors: Priors,
     thin: bool = False,
     robust_px: float | None = None,
+    mounts: Mounts = NO_MOUNTS,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """One structureless factor per keyframe over all it was measured against, and the priors."""
+    """One structureless factor per keyframe over all it was measured against, the priors and the mounts."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     members = {keyframe.frame for keyframe in keyframes}
     room = KEPT_BYTES
@@ -197,4 +212,5 @@ def build_graph(
                 room -= size
                 measure = cache(measure)
             graph.add(keyframe_factor(keyframe.frame, neighbours, {}, measure))
+    add_mounts(graph, values, mounts, [(keyframe.frame, X(*keyframe.frame)) for keyframe in keyframes])
     return graph, values

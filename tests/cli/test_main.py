@@ -163,7 +163,6 @@ def test_no_verb_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["missing", "--out", "{tmp}/o"], "missing: there is no such file or folder"),
         (["--out", "{tmp}/o"], "no input: give a CAPTURE folder"),
-        (["{demo}", "--out", "{tmp}/o", "--stage", "refinement"], "--stage refinement is not available"),
         (["{demo}", "--out", "{tmp}/o", "--set", "tracking.windw=3"], "did you mean tracking.window?"),
         (["{demo}", "--out", "{tmp}/o", "--config", "none.toml"], "none.toml: cannot be read"),
         (["{demo}", "--out", "{tmp}"], "not empty and not a reconstruction"),
@@ -196,7 +195,7 @@ def test_reconstruct(
     assert code == 0
     assert "82 of 82 frames have a pose" in said
     assert "2 cameras x 41 frames, 512x384, 30 fps" in err
-    assert "tracking 41/41 (100 %)" in err
+    assert "refinement 41/41 (100 %)" in err
     assert Reconstruction.load(out).manifest["config"]["tracking"]["window"] == 20
     # Again: only with --resume (the same settings) or --overwrite.
     code, _, err = run(capsys, "reconstruct", demo_capture(), "--out", out)
