@@ -53,8 +53,10 @@ def static_residual(inverse_depth: Float32, edges: Sequence[Edge]) -> Float32:
     own = [edge for edge in edges if edge.j[0] == edge.i[0]]
     table = np.full((len(own), rho.size), np.nan, np.float32)
     for row, edge in zip(table, own, strict=True):
-        sure = edge.weight >= SURE_WEIGHT
-        residual = edge.terms(rho[edge.pixels]).residual[sure]
+        terms = edge.terms(rho[edge.pixels])
+        # behind the camera the residual is zero, which must not pass for standing still
+        sure = (edge.weight >= SURE_WEIGHT) & terms.valid
+        residual = terms.residual[sure]
         row[edge.pixels[sure]] = np.hypot(residual[:, 0], residual[:, 1])
     if not own:
         return np.full(inverse_depth.shape, np.nan, np.float32)

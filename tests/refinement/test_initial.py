@@ -1,0 +1,247 @@
+"""Where the depth solve begins: the choice between depths, what is found to move, and its depth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.depth import DepthPrior, smoothness_weights, solve_frame
+from mvdyn_gtsam.refinement.edges import Edge
+from mvdyn_gtsam.refinement.initial import (
+    SURE_WEIGHT,
+    _triangulated,
+    best_candidate,
+    moving_regions,
+    region_depth,
+    static_residual,
+)
+from mvdyn_gtsam.refinement.residuals import confidence
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+from tests.refinement.dense_edges import (
+    Mask,
+    small_view,
+    true_edge,
+    true_edges,
+    true_theta,
+    with_motion,
+    with_wrong_flow,
+)
+from tests.refinement.scenes import Scene, two_cameras
+
+CONFIG = RefinementConfig()
+FRAME: Frame = (0, 2)
+VIEW = small_view(2)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return two_cameras(times=5)
+
+
+@pytest.fixture(scope="module")
+def truth(scene: Scene) -> Float32:
+    """Inverse depth."""
+    return np.exp(true_theta(scene, FRAME, VIEW))
+
+
+@pytest.fixture(scope="module")
+def edges(scene: Scene) -> list[Edge]:
+    return true_edges(scene, FRAME, VIEW)
+
+
+@pytest.fixture(scope="module")
+def own_edges(edges: list[Edge]) -> list[Edge]:
+    """Within the camera."""
+    return [edge for edge in edges if edge.j[0] == FRAME[0]]
+
+
+def square(row: int, col: int, size: int) -> Mask:
+    mask = np.zeros(VIEW.shape, bool)
+    mask[row : row + size, col : col + size] = True
+    return mask
+
+
+def middle() -> tuple[slice, slice]:
+    """Without the border, where few edges see anything."""
+    return np.s_[6:-6, 8:-8]
+
+
+def test_each_pixel_takes_the_candidate_that_the_flow_likes(truth: Float32, own_edges: list[Edge]) -> None:
+    """The first is right on the left, the second in the middle, the third on the right."""
+    third = VIEW.shape[1] // 3
+    parts = (np.s_[:, :third], np.s_[:, third : 2 * third], np.s_[:, 2 * third :])
+    candidates = []
+    for part in parts:
+        candidate = 0.5 * truth
+        candidate[part] = truth[part]
+        candidates.append(candidate)
+    # flow to anywhere is no better for any of them, and no depth can be triangulated from it
+    found = best_candidate(candidates, with_wrong_flow(own_edges, 0.1), CONFIG)
+    right = np.abs(np.log(found / truth)) < 0.02
+    assert right[middle()].mean() > 0.97
+    assert (np.abs(np.log(candidates[0] / truth)) < 0.02)[middle()].mean() < 0.4
+
+
+def test_the_first_candidate_stays_unless_another_is_clearly_better(
+    truth: Float32, own_edges: list[Edge]
+) -> None:
+    for first, second in ((1.002 * truth, truth), (truth, 1.002 * truth)):
+        found = best_candidate([first, second], own_edges, CONFIG, margin=2.0)
+        np.testing.assert_array_equal(found[middle()], first[middle()])
+
+
+def test_without_edges_the_first_candidate_stays(truth: Float32) -> None:
+    np.testing.assert_array_equal(best_candidate([truth, 2.0 * truth], [], CONFIG), truth)
+
+
+def test_triangulated_depth_is_a_candidate(truth: Float32, edges: list[Edge]) -> None:
+    """No candidate is right anywhere."""
+    across = next(edge for edge in edges if edge.same_instant)
+    found = best_candidate([0.7 * truth], edges, CONFIG)
+    right = np.abs(np.log(found / truth)) < 0.02
+    # the other camera alone is far enough away
+    assert right.ravel()[across.pixels].mean() > 0.95
+
+
+def test_triangulation_from_exact_flow_is_exact(scene: Scene, truth: Float32) -> None:
+    edge = true_edge(scene, FRAME, (1, 2), VIEW)
+    found = _triangulated(edge, np.full(truth.shape, -1.0, np.float32))
+    inside = np.zeros(truth.size, bool)
+    inside[edge.pixels] = True
+    known = found.ravel() > 0.0
+    # where the edge says nothing, or all is too far for its baseline, the fallback stays
+    assert (found.ravel()[~inside] == -1.0).all()
+    assert known.sum() > 0.95 * inside.sum()
+    np.testing.assert_allclose(found.ravel()[known], truth.ravel()[known], rtol=2e-4)
+
+
+def test_triangulation_needs_parallax(scene: Scene, truth: Float32) -> None:
+    edge = true_edge(scene, FRAME, (1, 2), VIEW)
+    jTi = edge.jTi.copy()
+    jTi[:3, 3] *= 0.01
+    close = replace(edge, jTi=jTi)
+    residual = np.asarray(close.terms(truth.ravel()[edge.pixels]).residual, np.float32)
+    close = replace(close, target=edge.target + residual)
+    np.testing.assert_array_equal(_triangulated(close, truth), truth)
+
+
+def test_the_static_model_explains_a_static_scene(truth: Float32, edges: list[Edge]) -> None:
+    residual = static_residual(truth, edges)
+    seen = np.isfinite(residual)
+    assert seen[middle()].all() and residual[seen].max() < 1e-3
+
+
+def test_the_static_model_fails_where_something_moves(truth: Float32, edges: list[Edge]) -> None:
+    block = square(20, 30, 16)
+    residual = static_residual(truth, with_motion(edges, block, (2.0, -3.0)))
+    length = np.hypot(2.0, 3.0)
+    # offsets of 1 and 2 frames: the median of four is that of one frame
+    np.testing.assert_allclose(residual[block], length, rtol=1e-3)
+    assert np.nanmax(residual[~block]) < 1e-3
+
+
+def test_only_sure_flow_within_the_camera_in_front_of_it_judges(
+    scene: Scene, truth: Float32, edges: list[Edge], own_edges: list[Edge]
+) -> None:
+    across = [edge for edge in edges if edge.j[0] != FRAME[0]]
+    assert len(across) == 1 and np.isnan(static_residual(truth, across)).all()
+    unsure = [replace(edge, weight=edge.weight * np.float32(0.9 * SURE_WEIGHT)) for edge in own_edges]
+    assert np.isnan(static_residual(truth, unsure)).all()
+    jTi = own_edges[0].jTi.copy()
+    jTi[2, 3] = -100.0
+    behind = replace(own_edges[0], jTi=jTi)
+    assert np.isnan(static_residual(truth, [behind])).all(), "a point behind the camera explains nothing"
+
+
+def test_a_moving_block_is_found() -> None:
+    block = square(20, 30, 16)
+    residual = np.where(block, 3.0 * CONFIG.moving_px, 0.1).astype(np.float32)
+    labels = moving_regions(residual, CONFIG)
+    found = labels > 0
+    assert len(np.unique(labels[found])) == 1
+    assert (found & block).sum() > 0.95 * block.sum() and (found & ~block).sum() == 0
+
+
+def test_two_blocks_are_two_regions() -> None:
+    residual = np.where(square(10, 10, 12) | square(35, 55, 12), 5.0, 0.1).astype(np.float32)
+    labels = moving_regions(residual, CONFIG)
+    assert labels[16, 16] > 0 and labels[41, 61] > 0 and labels[16, 16] != labels[41, 61]
+
+
+def test_specks_noise_and_the_unknown_do_not_move() -> None:
+    rng = np.random.default_rng(0)
+    specks = np.where(rng.random(VIEW.shape) < 0.03, 20.0, 0.1).astype(np.float32)
+    small = np.where(square(20, 30, 3), 20.0, 0.1).astype(np.float32)
+    # a large patch that hardly fails: flow on a plain wall
+    weak = np.where(square(20, 30, 16), 1.5 * CONFIG.moving_px, 0.1).astype(np.float32)
+    unknown = np.full(VIEW.shape, np.nan, np.float32)
+    for residual in (specks, small, weak, unknown):
+        assert (moving_regions(residual, CONFIG) == 0).all()
+
+
+def test_gaps_in_a_moving_region_are_closed() -> None:
+    block = square(20, 30, 20)
+    residual = np.where(block, 5.0, 0.1).astype(np.float32)
+    # its plain inside: static as far as flow can tell
+    residual[28:30, 30:50] = 0.1
+    labels = moving_regions(residual, CONFIG)
+    assert labels[22, 40] > 0 and labels[22, 40] == labels[46 - 10, 40] == labels[29, 40]
+
+
+def test_a_region_takes_its_commonest_depth() -> None:
+    rng = np.random.default_rng(1)
+    region = square(20, 30, 10)
+    instant = np.full(VIEW.shape, 0.1, np.float32)
+    values = 0.5 * np.exp(rng.normal(0.0, 0.01, 100))
+    values[:20] = rng.uniform(0.1, 0.3, 20)
+    values[20:35] = rng.uniform(0.7, 2.0, 15)
+    instant[region] = values
+    depth, agreement = region_depth(instant, region)
+    assert agreement == pytest.approx(0.65, abs=0.03)
+    np.testing.assert_allclose(depth[35:], values[35:], rtol=1e-5)
+    np.testing.assert_allclose(depth[:35], 0.5, rtol=0.02)
+
+
+def test_a_region_without_agreement_says_so() -> None:
+    region = square(20, 30, 20)
+    instant = np.exp(np.random.default_rng(2).uniform(-3.0, 1.0, VIEW.shape)).astype(np.float32)
+    assert region_depth(instant, region)[1] < CONFIG.moving_agreement
+
+
+@pytest.mark.parametrize("value", [0.01, 0.3, 0.5, 1.0, 7.3])
+def test_a_region_of_one_depth_agrees_wholly(value: float) -> None:
+    region = square(2, 3, 5)
+    depth, agreement = region_depth(np.full(VIEW.shape, value, np.float32), region)
+    assert agreement == 1.0
+    np.testing.assert_allclose(depth, value, rtol=1e-6)
+
+
+def test_temporal_edges_of_what_moves_lose_their_weight_by_themselves(
+    scene: Scene, truth: Float32, edges: list[Edge]
+) -> None:
+    """Nobody says what moves: the solve sees four edges in time that are wrong about the block and one to
+    the other camera that is right."""
+    block = square(20, 32, 12)
+    seen = with_motion(edges, block, (1.5, -2.5))
+    start = np.log(truth) + np.float32(0.03)
+    prior = DepthPrior(start, np.full(start.shape, 1.0, np.float32))
+    image = smoothness_weights(60.0 * np.log(truth), CONFIG.edge_contrast)
+    config = replace(CONFIG, smoothness=0.2)
+    solved, _ = solve_frame(start, seen, {}, image, prior, config, 10)
+    rho = np.exp(solved).ravel()
+    inside = block.ravel()
+    for edge in seen:
+        residual = edge.terms(rho[edge.pixels]).residual
+        trust = confidence(np.abs(residual).sum(axis=1), config.flow_lambda)
+        moving, still = np.median(trust[inside[edge.pixels]]), np.median(trust[~inside[edge.pixels]])
+        assert still > 0.99
+        if edge.same_instant:
+            assert moving > 0.99
+        else:
+            assert moving < 0.3 * still
+    # so the other camera alone says how far away the block is
+    assert np.median(np.abs(solved - np.log(truth))[block]) < 0.01
