@@ -67,24 +67,55 @@ def static_residual(inverse_depth: Float32, edges: Sequence[Edge]) -> Float32:
     return np.take_along_axis(table, middle[None], axis=0)[0].reshape(inverse_depth.shape)
 
 
-def moving_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[np.int32]:
-    """Label ``(h, w)`` of the regions where the static model fails, 0 elsewhere; ``residual`` px, NaN:
-    unknown."""
+def failing_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[np.uint8]:
+    """``(h, w)`` 1 in the regions where the static model fails; ``residual (h, w)`` px, NaN: unknown."""
     fails = cv2.medianBlur((np.nan_to_num(residual) > config.moving_px).astype(np.uint8), 5)
-    side = 2 * round(config.moving_gap * residual.shape[1] / 2) + 1
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    closed = cv2.morphologyEx(fails, cv2.MORPH_CLOSE, kernel)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed)
-    result = np.zeros(residual.shape, np.int32)
+    labels = _regions(_closed(fails, config), config)
     strong = np.nan_to_num(residual) > 2.0 * config.moving_px
-    for label in range(1, count):
+    result = np.zeros(residual.shape, np.uint8)
+    for label in range(1, labels.max() + 1):
         region = labels == label
-        # small or hardly failing: noise of flow on plain walls, not motion
-        if (
-            stats[label, cv2.CC_STAT_AREA] >= config.moving_area * residual.size
-            and strong[region].mean() > 0.3
-        ):
-            result[region] = label
+        # hardly failing: noise of flow on plain walls, not motion
+        if strong[region].mean() > 0.3:
+            result[region] = 1
+    return result
+
+
+def moving_regions(
+    own: npt.NDArray[np.uint8],
+    edges: Sequence[Edge],
+    there: Sequence[npt.NDArray[np.uint8]],
+    config: RefinementConfig,
+) -> npt.NDArray[np.int32]:
+    """Label ``(h, w)`` of the regions that move, 0 elsewhere.
+
+    ``own (h, w)`` says where the static model fails in this frame, ``there`` where it does in the frames
+    that the ``edges`` lead to. The pixels and those that the flow finds there vote: what moves evenly along
+    its epipolar lines for a moment passes for static in one frame, and noise for motion, but not in most.
+    """
+    votes, count = own.astype(np.float32).ravel(), np.ones(own.size, np.float32)
+    for edge, fails in zip(edges, there, strict=True):
+        seen = (edge.nearest >= 0) & (edge.weight >= SURE_WEIGHT)
+        votes[edge.pixels[seen]] += fails.ravel()[edge.nearest[seen]]
+        count[edge.pixels[seen]] += 1.0
+    moves = (votes >= config.moving_share * count).astype(np.uint8).reshape(own.shape)
+    return _regions(_closed(cv2.medianBlur(moves, 5), config), config)
+
+
+def _closed(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArray[np.uint8]:
+    """``mask (h, w)`` with its gaps closed."""
+    side = 2 * round(config.moving_gap * mask.shape[1] / 2) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    return np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel), np.uint8)
+
+
+def _regions(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArray[np.int32]:
+    """Connected parts of ``mask (h, w)``, numbered from 1; specks are left out."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+    result = np.zeros(mask.shape, np.int32)
+    kept = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= config.moving_area * mask.size]
+    for number, label in enumerate(kept, start=1):
+        result[labels == label] = number
     return result
 
 

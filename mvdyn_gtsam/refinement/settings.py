@@ -79,6 +79,8 @@ class RefinementConfig:
     """Smallest region that may move, as a share of the image. Source: choice."""
     moving_gap: float = 0.04
     """Gaps in a moving region up to this share of the image's width are closed. Source: choice."""
+    moving_share: float = 0.4
+    """Share of the frames around that must see the static model fail. Source: choice."""
     moving_agreement: float = 0.2
     """Share of a moving region whose depth from the same instant must agree before it is believed. Source:
     choice."""

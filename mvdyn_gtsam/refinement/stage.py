@@ -34,8 +34,8 @@ Array = npt.NDArray[np.float64]
 
 BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
-BYTES_PER_PIXEL = 34.0
-"""Of a view on disk besides its flow: eight arrays of 32 bits and two of 8."""
+BYTES_PER_PIXEL = 50.0
+"""Of a view on disk besides its flow: twelve arrays of 32 bits and two of 8."""
 SECONDS_PER_MEGAPIXEL = 0.25
 """One flow pair on one processor, per million pixels of the input; measured, DIS at half resolution."""
 
@@ -126,6 +126,7 @@ class Refinement:
                 self._step("phase 1", self._align)
             if config.phase2:
                 self._step("begin", lambda: self._map("begin", self._frames))
+                self._step("settle", lambda: self._map("settle", self._frames))
                 self._depth = "begun"
                 self._solve_depth(FIRST_DEPTH)
                 self._step("wide flow", lambda: self._map("wide flow", self._across))
@@ -165,9 +166,10 @@ class Refinement:
         workspace, tracked = self._workspace, self._tracked
         workspace.create("grey", np.uint8, full_size=True)
         workspace.create("moving", np.uint8)
+        workspace.create("fails", np.uint8)
         for name in (
-            "tracked", "tracked_confidence", "aligned", "swept", "instant", "prior", "prior_weight", "begun",
-            "information",
+            "tracked", "tracked_confidence", "aligned", "swept", "instant", "prior", "prior_weight", "first",
+            "begun", "information",
         ):  # fmt: skip
             workspace.create(name)
         for done, frame in enumerate(self._frames):

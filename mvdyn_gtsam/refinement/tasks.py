@@ -22,6 +22,7 @@ from mvdyn_gtsam.refinement.edges import Edge, load_edges
 from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
     best_candidate,
+    failing_regions,
     moving_regions,
     region_depth,
     static_residual,
@@ -106,19 +107,31 @@ def _measure(context: Context, pair: Pair, guide: str) -> None:
 
 
 def begin_task(context: Context, frame: Frame) -> None:
-    """The depth that phase 2 begins with, what moves, and the prior."""
+    """First depth of a frame as if nothing moved, and where that fails."""
     workspace, config = context.workspace, context.config
     edges = context.edges(frame, context.poses(), own_camera=True)
     weights = _image_weights(context, frame)
-    aligned = context.image("aligned", frame)
-    chosen = best_candidate([aligned, context.image("swept", frame)], edges, config)
+    chosen = best_candidate([context.image("aligned", frame), context.image("swept", frame)], edges, config)
     weak = DepthPrior(np.log(chosen), np.full(chosen.shape, config.prior_sigma**-2, np.float32))
     theta, information = solve_frame(np.log(chosen), edges, {}, weights, weak, config, FIRST_STEPS)
-    labels = moving_regions(static_residual(np.exp(theta), edges), config)
-    trust = information / np.float32(TRUSTED_SIGMA**-2) / (1.0 + information / np.float32(TRUSTED_SIGMA**-2))
+    workspace.write("first", frame, theta)
+    workspace.write("information", frame, information)
+    workspace.write("fails", frame, failing_regions(static_residual(np.exp(theta), edges), config))
+
+
+def settle_task(context: Context, frame: Frame) -> None:
+    """What moves in a frame, by the vote of the frames around it, and the depth that phase 2 begins with."""
+    workspace, config = context.workspace, context.config
+    edges = context.edges(frame, context.poses(), own_camera=True)
+    theta = context.image("first", frame)
+    near = [edge for edge in edges if abs(edge.j[1] - frame[1]) <= max(config.temporal_offsets, default=0)]
+    votes = [np.asarray(workspace.read("fails", edge.j)) for edge in near]
+    labels = moving_regions(np.asarray(workspace.read("fails", frame)), near, votes, config)
+    information = context.image("information", frame)
+    trust = information / (information + np.float32(TRUSTED_SIGMA**-2))
     trust[labels > 0] = 0.0
-    # depth of what moves must not leak into the plain wall behind it
-    # what is plain mostly stands behind: an average of depth cubed leans to the far side
+    # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
+    # an average of depth cubed leans to the far side
     cubed = filled(np.exp(-3.0 * theta).astype(np.float32), trust)
     theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
     moving = np.where(labels > 0, UNEXPLAINED, STATIC).astype(np.uint8)
@@ -306,6 +319,7 @@ TASKS = {
     "temporal flow": temporal_flow_task,
     "wide flow": wide_flow_task,
     "begin": begin_task,
+    "settle": settle_task,
     "window": window_task,
     "sample": sample_task,
     "finish": finish_task,
