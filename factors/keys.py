@@ -1,8 +1,9 @@
-"""Variable keys of the graph: the pose ``X`` and the log depth scale ``S`` of a (camera, time) frame.
+"""Variable keys of the graph: pose ``X`` and log depth scale ``S`` of a (camera, time) frame, mount ``M``.
 
 A key packs ``character (8 bits) | camera (16 bits) | time (40 bits)`` into one integer, so sorting keys sorts
 by kind, camera and time. ``gtsam.DefaultKeyFormatter`` prints the character and one number; use ``key_name``.
-``X`` holds a ``gtsam.Pose3`` (wTc), ``S`` a plain double (``values.insert(S(c, t), 0.0)``, ``atDouble``).
+``X`` holds a ``gtsam.Pose3`` (wTc), ``S`` a plain double (``values.insert(S(c, t), 0.0)``, ``atDouble``),
+``M`` the ``gtsam.Pose3`` aTb of two cameras a and b mounted on one another, b in place of the time.
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ def X(camera: int, time: int) -> int:  # noqa: N802 - the field's name for a pos
 def S(camera: int, time: int) -> int:  # noqa: N802 - the field's name for a scale key
     """Key of the log depth scale of a camera at a time index."""
     return _pack("s", camera, time)
+
+
+def M(camera_a: int, camera_b: int) -> int:  # noqa: N802 - in line with the others
+    """Key of the relative pose ``aTb`` of two cameras mounted on one another."""
+    return _pack("m", camera_a, camera_b)
 
 
 def camera_and_time(key: int) -> tuple[int, int]:

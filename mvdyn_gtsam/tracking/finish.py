@@ -23,6 +23,7 @@ from mvdyn_gtsam.tracking.model import (
 )
 from mvdyn_gtsam.tracking.motion import PoseFit, predict_pose
 from mvdyn_gtsam.tracking.polish import estimate_noise, marginal_covariances, solve_all, total_cost
+from mvdyn_gtsam.tracking.rig import hold_mounts
 from mvdyn_gtsam.tracking.state import TrackState
 from mvdyn_gtsam.tracking.window import solve_depth, useful_neighbours
 
@@ -37,7 +38,9 @@ def finish(state: TrackState, on_progress: OnProgress | None = None) -> Tracking
     """Polish and collect; ``state`` holds the polished keyframes afterwards."""
     polish(state, on_progress)
     began = perf_counter()
-    covariance = marginal_covariances(state.keyframes, state.views, state.tracking, state.priors)
+    covariance = marginal_covariances(
+        state.keyframes, state.views, state.tracking, state.priors, state.mounts
+    )
     state.count_time("covariance", began)
     return _result(state, covariance)
 
@@ -57,7 +60,17 @@ def polish(state: TrackState, on_progress: OnProgress | None = None) -> None:
         last = polish_round == state.tracking.polish_rounds
         # the first solve starts from the window's poses, with errors that a narrow loss would not see
         robust_px = state.tracking.window_robust_px if polish_round == 0 else state.tracking.robust_px
-        solve_all(keyframes, state.views, state.tracking, state.priors, thin=not last, robust_px=robust_px)
+        solve_all(
+            keyframes,
+            state.views,
+            state.tracking,
+            state.priors,
+            thin=not last,
+            robust_px=robust_px,
+            mounts=state.mounts,
+        )
+        if polish_round == 0:
+            state.mounts = hold_mounts(state)
         if not last:
             estimate_noise(keyframes, state.views, state.tracking)
         state.count_time("polish solve", began)

@@ -17,7 +17,7 @@ from factors.keys import M, S, X
 from factors.measurement import StructurelessMeasurement
 from factors.projection import reproject
 from mvdyn_gtsam.config import TrackingConfig
-from mvdyn_gtsam.frontend.rig import Pair, RigConfig, add_mounts, likely_mounts, solved_mounts
+from mvdyn_gtsam.frontend.rig import Pair, add_mounts
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.tracking.keyframe_factor import keyframe_factor
 from mvdyn_gtsam.tracking.model import Keyframe, View, measurement_of
@@ -66,21 +66,28 @@ def solve_all(
     ``thin`` uses every second grid point: enough between two rounds of measuring. ``mounts`` are held, their
     relative poses being solved for.
     """
-    frames = {keyframe.frame: keyframe for keyframe in keyframes}
     graph, values = build_graph(keyframes, views, config, priors, thin, robust_px, mounts)
     before = graph.error(values)
-    result, after, iterations = _minimise(graph, values, before, config)
-    for keyframe in keyframes:
-        keyframe.wTc = result.atPose3(X(*keyframe.frame)).matrix()
-        keyframe.log_scale = result.atDouble(S(*keyframe.frame))
-    for keyframe in keyframes:
-        solve_depth(keyframe, frames, views, config)
+    result, after, iterations = minimise(graph, values, before, config)
+    take_solution(result, keyframes, views, config)
     solve = PolishSolve(before, after, iterations)
     logger.debug("polish: %.1f -> %.1f in %d iterations", *vars(solve).values())
     return solve
 
 
-def _minimise(
+def take_solution(
+    solution: gtsam.Values, keyframes: list[Keyframe], views: tuple[View, ...], config: TrackingConfig
+) -> None:
+    """Write a solution into ``keyframes``, and solve their depths at it."""
+    for keyframe in keyframes:
+        keyframe.wTc = solution.atPose3(X(*keyframe.frame)).matrix()
+        keyframe.log_scale = solution.atDouble(S(*keyframe.frame))
+    frames = {keyframe.frame: keyframe for keyframe in keyframes}
+    for keyframe in keyframes:
+        solve_depth(keyframe, frames, views, config)
+
+
+def minimise(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, error: float, config: TrackingConfig
 ) -> tuple[gtsam.Values, float, int]:
     """Levenberg-Marquardt in short runs, each followed by a search further along the way it went.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from time import perf_counter
 
 import gtsam
@@ -16,6 +16,7 @@ from mvdyn_gtsam.config import Config
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
+from mvdyn_gtsam.frontend.rig import Pair
 from mvdyn_gtsam.frontend.start import Start
 from mvdyn_gtsam.graph.connections import ConnectionGraph, Edge, EdgeKind, Frame
 from mvdyn_gtsam.tracking.connect import inter_camera_edges
@@ -38,6 +39,9 @@ class TrackState:
         """Raises TrackingError where the start does not fit the cameras."""
         _check_start(cameras, start)
         self.tracking, self.graph_config = config.tracking, config.graph
+        self.rig_config = config.frontend.wide_baseline.adjustment.rig
+        self.mounts: Mapping[Pair, Array] = {}
+        """Cameras found to be mounted on one another, and their relative poses ``aTb``."""
         self.start, self.units = normalised_start(start)
         self.views = tuple(View.of(camera, config.tracking.grid_points) for camera in cameras)
         self.images = ImageStore(config.tracking.image_cache_mb * 2**20, read, isinstance(flow, OneWayFlow))

@@ -20,6 +20,7 @@ from mvdyn_gtsam.frontend.joint_adjustment import (
     _search,
     adjust_maps,
 )
+from mvdyn_gtsam.frontend.rig import RigConfig, likely_mounts
 from mvdyn_gtsam.frontend.single_camera import CameraMap
 from mvdyn_gtsam.frontend.start import StartFrame
 from mvdyn_gtsam.geometry import Similarity, invert_pose, project, rotation_angle_deg, transform_points
@@ -199,3 +200,42 @@ def test_shared_points_all_enter_and_the_best_seen_of_one_camera() -> None:
 def test_nonsense_is_refused() -> None:
     with pytest.raises(ConfigError, match="search_px"):
         AdjustmentConfig(search_px=(5.0, 0.0))
+
+
+def adjusted_pair(wTa: Array, wTb: Array, rig: RigConfig) -> Array:
+    """``aTb (K, 4, 4)`` after adjustment of two cameras whose maps' scales drift apart."""
+    maps = []
+    for camera, truth in enumerate((wTa, wTb)):
+        exact = camera_map(camera, SCENE, truth, IDENTITY, noise_px=0.3)
+        growing = exact.mTc.copy()
+        growing[:, :3, 3] *= np.linspace(0.98, 1.02, len(growing))[:, None]
+        maps.append(replace(exact, mTc=growing))
+    group = {0: IDENTITY, 1: IDENTITY}
+    pairs = [(0, 1, common_points(maps, 12))]
+    frames = adjust_maps([CAMERA, CAMERA], maps, group, pairs, AdjustmentConfig(rig=rig))
+    a, b = (np.stack([frame.wTc for frame in frames[camera]]) for camera in (0, 1))
+    return invert_pose(a) @ b
+
+
+def spread(aTb: Array) -> float:
+    return float(np.linalg.norm(aTb[:, :3, 3] - aTb[:, :3, 3].mean(axis=0), axis=1).max())
+
+
+def test_cameras_mounted_on_one_another_are_held() -> None:
+    mount = invert_pose(TRUTH[0][0]) @ TRUTH[1][0]
+    held = adjusted_pair(TRUTH[0], TRUTH[0] @ mount, RigConfig())
+    free = adjusted_pair(TRUTH[0], TRUTH[0] @ mount, RigConfig(rotation_deg=0.0))
+    assert spread(held) < 1e-4 < spread(free)
+    distance = np.linalg.norm(held[:, :3, 3], axis=1).mean()
+    assert distance == pytest.approx(np.linalg.norm(mount[:3, 3]), rel=0.03)
+
+
+def test_cameras_that_slide_apart_are_not_held() -> None:
+    """They keep their rotation and nearly their distance: only the images tell."""
+    aTb = np.tile(invert_pose(TRUTH[0][0]) @ TRUTH[1][0], (6, 1, 1))
+    aTb[:, :3, 3] *= np.linspace(0.95, 1.05, 6)[:, None]
+    poses = {(0, time): pose for time, pose in enumerate(TRUTH[0])}
+    poses |= {(1, time): pose for time, pose in enumerate(TRUTH[0] @ aTb)}
+    assert likely_mounts(poses, RigConfig())
+    found = adjusted_pair(TRUTH[0], TRUTH[0] @ aTb, RigConfig())
+    assert spread(found) == pytest.approx(spread(aTb), rel=0.2)

@@ -113,6 +113,24 @@ def two_cameras(count: int = 9, moving: tuple[bool, ...] = (True, True)) -> Scen
             angle = (0.004 * s, -0.006 * s + 0.12 * index, 0.002 * s)
             wTc[index, time, :3, :3] = Rotation.from_rotvec(angle).as_matrix()
             wTc[index, time, :3, 3] = (0.05 * s - 0.9 * index, 0.02 * s + 0.1 * index, 0.03 * s)
-    pairs = [[render(wTc[i, t], cameras[i]) for t in range(count)] for i in range(len(moving))]
+    return _rendered(cameras, wTc)
+
+
+def rig(count: int = 9) -> Scene:
+    """Two cameras mounted on one another, so far apart that they see much the same."""
+    wTc = np.tile(np.eye(4), (2, count, 1, 1))
+    for time in range(count):
+        turn = Rotation.from_rotvec((0.006 * time, -0.01 * time, 0.02 * np.sin(time)))
+        wTc[0, time, :3, :3] = turn.as_matrix()
+        wTc[0, time, :3, 3] = (0.05 * time, 0.02 * np.sin(time), 0.04 * time)
+    mount = np.eye(4)
+    mount[:3, :3] = Rotation.from_rotvec((0.01, 0.1, 0.0)).as_matrix()
+    mount[:3, 3] = (-0.7, 0.1, 0.0)
+    wTc[1] = wTc[0] @ mount
+    return _rendered((camera("cam0"), camera("cam1")), wTc)
+
+
+def _rendered(cameras: tuple[Camera, ...], wTc: np.ndarray) -> Scene:
+    pairs = [[render(pose, view) for pose in track] for view, track in zip(cameras, wTc, strict=True)]
     images = [[image for image, _ in track] for track in pairs]
     return Scene(cameras, wTc, images, [[depth for _, depth in track] for track in pairs])
