@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,8 +71,9 @@ class Workspace:
     def finish(self, step: str) -> None:
         """Note a step as finished."""
         temporary = self.folder / f".{JOURNAL}.part"
-        temporary.write_text(json.dumps([*self.finished(), step]))
-        temporary.replace(self.folder / JOURNAL)
+        with _writing(self.folder / JOURNAL):
+            temporary.write_text(json.dumps([*self.finished(), step]))
+            temporary.replace(self.folder / JOURNAL)
 
     def create(self, name: str, dtype: type = np.float32, full_size: bool = False) -> None:
         """Make an array per camera, one image per frame, filled with zeros."""
@@ -78,10 +81,8 @@ class Workspace:
             shape = (view.camera.height, view.camera.width) if full_size else view.shape
             path = self._path(name, camera)
             if not path.is_file():
-                array = np.lib.format.open_memmap(
-                    path, mode="w+", dtype=dtype, shape=(self.frame_count, *shape)
-                )
-                array.flush()
+                with _writing(path):
+                    _write_zeros(path, np.dtype(dtype), (self.frame_count, *shape))
 
     def read(self, name: str, frame: Frame) -> npt.NDArray[np.generic]:
         """One image of an array."""
@@ -95,9 +96,10 @@ class Workspace:
 
     def write_array(self, name: str, array: npt.NDArray[np.float64]) -> None:
         """Keep one array of its own, such as the poses; the old one stays until the new one is whole."""
-        temporary = self.folder / f".{name}.part.npy"
-        np.save(temporary, array)
-        temporary.replace(self.folder / f"{name}.npy")
+        temporary, path = self.folder / f".{name}.part.npy", self.folder / f"{name}.npy"
+        with _writing(path):
+            np.save(temporary, array)
+            temporary.replace(path)
 
     def read_array(self, name: str) -> npt.NDArray[np.float64]:
         """What ``write_array`` kept."""
@@ -124,8 +126,9 @@ class Workspace:
             arrays[f"{name}_steps"] = np.array(steps)
         path = self._flow_path(i, j)
         temporary = path.with_name(f".{path.name}.part.npz")
-        np.savez(temporary, **arrays)
-        temporary.replace(path)
+        with _writing(path):
+            np.savez(temporary, **arrays)
+            temporary.replace(path)
 
     def read_flow(self, i: Frame, j: Frame, backward: bool = False) -> DirectedFlow:
         """One direction of a measured pair: i to j, or with ``backward`` j to i."""
@@ -152,3 +155,27 @@ class Workspace:
 
     def _flow_path(self, i: Frame, j: Frame) -> Path:
         return self.folder / "flow" / f"{i[0]}_{i[1]:06d}_{j[0]}_{j[1]:06d}.npz"
+
+
+def _write_zeros(path: Path, dtype: np.dtype[np.generic], shape: tuple[int, ...]) -> None:
+    """A whole ``.npy`` or none, its space taken: a map over a hole kills the process on a full disk."""
+    temporary = path.with_name(f".{path.name}.part")
+    header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    image = np.zeros(shape[1:], dtype).tobytes()
+    with temporary.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        for _ in range(shape[0]):
+            file.write(image)
+    temporary.replace(path)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Name the file that cannot be written. Raises ResultError."""
+    try:
+        yield
+    except OSError as error:
+        raise ResultError(
+            f"{path}: cannot be written ({error.strerror or error}); what was finished is kept, continue with"
+            " --resume when that is mended"
+        ) from error

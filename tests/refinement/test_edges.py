@@ -75,6 +75,14 @@ def test_both_directions_reproject_the_true_depth(tmp_path: Path, i: Frame, j: F
         rho = np.full(len(edge.pixels), 1.0 / (DEPTH - wTc[own][2, 3]), np.float32)
         residual = edge.terms(rho).residual[whole]
         assert np.abs(residual).max() < 0.6 / (STEPS_PER_PX * scale)
+        # the nearest pixel of the other view is within half a pixel of the target, either way
+        height, width = workspace.views[other[0]].shape
+        size = np.array([(LARGE, SMALL)[other[0]].width, (LARGE, SMALL)[other[0]].height])
+        small = (edge.target[whole] + 0.5) * ([width, height] / size) - 0.5
+        row, col = np.divmod(edge.nearest[whole], width)
+        within = edge.nearest[whole] >= 0
+        assert within.mean() > 0.9
+        assert np.abs(np.stack([col, row], axis=1) - small)[within].max() < 0.5 + 1e-3
 
 
 def test_only_measured_neighbours_give_edges(tmp_path: Path) -> None:

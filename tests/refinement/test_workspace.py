@@ -148,6 +148,22 @@ def test_making_an_array_again_keeps_it(tmp_path: Path) -> None:
     assert (kept.read("depth", (0, 2)) == 1.0).all()
 
 
+def test_an_array_takes_its_space_when_it_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not when its pages are written to: that would kill the process instead of raising an error."""
+    kept = workspace(tmp_path)
+    kept.create("depth")
+    path = kept.folder / "depth_0.npy"
+    assert path.stat().st_blocks * 512 >= 5 * 16 * 24 * 4
+
+    def full(self: Path, mode: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(ResultError, match=r"swept_0.npy: cannot be written \(No space left"):
+        kept.create("swept")
+    assert not (kept.folder / "swept_0.npy").exists()
+
+
 def test_what_is_read_is_a_copy(tmp_path: Path) -> None:
     kept = workspace(tmp_path)
     kept.create("depth")
@@ -167,7 +183,7 @@ def test_arrays_are_replaced_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "save", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(ResultError, match=r"poses.npy: cannot be written \(No space left on device\)"):
         kept.write_array("poses", np.zeros((4, 4)))
     np.testing.assert_array_equal(kept.read_array("poses"), 2.0 * np.eye(4))
 
@@ -191,7 +207,7 @@ def test_a_journal_half_written_loses_no_step(tmp_path: Path, monkeypatch: pytes
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "write_text", full)
-        with pytest.raises(OSError, match="No space left"):
+        with pytest.raises(ResultError, match=r"journal.json: cannot be written \(No space left"):
             kept.finish("sweep")
     resumed = workspace(tmp_path)
     assert resumed.finished() == ["images"] and resumed.has_flow(A, B)
