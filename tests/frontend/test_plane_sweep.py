@@ -125,6 +125,14 @@ def test_a_view_that_sees_nothing_changes_nothing() -> None:
     np.testing.assert_allclose(after.inverse_depth, before.inverse_depth, atol=0.05 * STEP)
 
 
+def test_what_would_be_behind_a_view_is_unseen_by_it() -> None:
+    """From 3 before the camera what is nearer than that is behind."""
+    grey = render(pose(0.0))[0]
+    likeness = patch_likeness(grey, INTRINSICS, seen(pose(0.0, z=3.0)), LADDER, CONFIG)
+    np.testing.assert_array_equal(likeness[LADDER > 1.0 / 3.0], np.float32(CONFIG.unseen))
+    assert (likeness[LADDER < 0.2] != np.float32(CONFIG.unseen)).any()
+
+
 def test_a_view_that_sees_a_part_does_not_hurt_the_rest() -> None:
     """Turned aside by 40 degrees, it sees a third of the image at most, and at some depths only."""
     views = [seen(wTc) for wTc in AROUND[:2]]

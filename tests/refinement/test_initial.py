@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
@@ -15,6 +16,7 @@ from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
     _triangulated,
     best_candidate,
+    failing_regions,
     moving_regions,
     region_depth,
     static_residual,
@@ -157,22 +159,14 @@ def test_only_sure_flow_within_the_camera_in_front_of_it_judges(
     assert np.isnan(static_residual(truth, [behind])).all(), "a point behind the camera explains nothing"
 
 
-def test_a_moving_block_is_found() -> None:
+def test_a_block_where_the_static_model_fails_is_found() -> None:
     block = square(20, 30, 16)
     residual = np.where(block, 3.0 * CONFIG.moving_px, 0.1).astype(np.float32)
-    labels = moving_regions(residual, CONFIG)
-    found = labels > 0
-    assert len(np.unique(labels[found])) == 1
+    found = failing_regions(residual, CONFIG) > 0
     assert (found & block).sum() > 0.95 * block.sum() and (found & ~block).sum() == 0
 
 
-def test_two_blocks_are_two_regions() -> None:
-    residual = np.where(square(10, 10, 12) | square(35, 55, 12), 5.0, 0.1).astype(np.float32)
-    labels = moving_regions(residual, CONFIG)
-    assert labels[16, 16] > 0 and labels[41, 61] > 0 and labels[16, 16] != labels[41, 61]
-
-
-def test_specks_noise_and_the_unknown_do_not_move() -> None:
+def test_specks_noise_and_the_unknown_do_not_fail() -> None:
     rng = np.random.default_rng(0)
     specks = np.where(rng.random(VIEW.shape) < 0.03, 20.0, 0.1).astype(np.float32)
     small = np.where(square(20, 30, 3), 20.0, 0.1).astype(np.float32)
@@ -180,16 +174,52 @@ def test_specks_noise_and_the_unknown_do_not_move() -> None:
     weak = np.where(square(20, 30, 16), 1.5 * CONFIG.moving_px, 0.1).astype(np.float32)
     unknown = np.full(VIEW.shape, np.nan, np.float32)
     for residual in (specks, small, weak, unknown):
-        assert (moving_regions(residual, CONFIG) == 0).all()
+        assert (failing_regions(residual, CONFIG) == 0).all()
 
 
-def test_gaps_in_a_moving_region_are_closed() -> None:
-    block = square(20, 30, 20)
-    residual = np.where(block, 5.0, 0.1).astype(np.float32)
+def test_gaps_in_a_failing_region_are_closed() -> None:
+    residual = np.where(square(20, 30, 20), 5.0, 0.1).astype(np.float32)
     # its plain inside: static as far as flow can tell
     residual[28:30, 30:50] = 0.1
-    labels = moving_regions(residual, CONFIG)
-    assert labels[22, 40] > 0 and labels[22, 40] == labels[46 - 10, 40] == labels[29, 40]
+    assert (failing_regions(residual, CONFIG)[22:38, 34:46] == 1).all()
+
+
+def voters(edges: list[Edge], block: Mask) -> list[npt.NDArray[np.uint8]]:
+    """Of each frame that the edges lead to: the block fails where it is seen there."""
+    masks = []
+    for edge in edges:
+        mask = np.zeros(VIEW.shape, np.uint8)
+        inside = block.ravel()[edge.pixels] & (edge.nearest >= 0)
+        mask.ravel()[edge.nearest[inside]] = 1
+        masks.append(mask)
+    return masks
+
+
+def test_what_the_frames_around_agree_on_moves(own_edges: list[Edge]) -> None:
+    """Of two blocks the frame itself saw one; the frames around saw the other."""
+    seen, missed = square(10, 10, 12), square(35, 35, 12)
+    labels = moving_regions(seen.astype(np.uint8), own_edges, voters(own_edges, missed), CONFIG)
+    assert (labels[seen] == 0).all()
+    assert (labels[missed] > 0).mean() > 0.9 and len(np.unique(labels[missed & (labels > 0)])) == 1
+    assert (labels[~missed] > 0).mean() < 0.01
+
+
+def test_flow_of_little_weight_carries_no_vote(own_edges: list[Edge]) -> None:
+    seen = square(10, 10, 12)
+    unsure = [replace(edge, weight=edge.weight * np.float32(0.9 * SURE_WEIGHT)) for edge in own_edges]
+    nothing = [np.zeros(VIEW.shape, np.uint8)] * len(own_edges)
+    own = seen.astype(np.uint8)
+    assert (moving_regions(own, own_edges, nothing, CONFIG) == 0).all()
+    for edges in (unsure, []):
+        labels = moving_regions(own, edges, nothing[: len(edges)], CONFIG)
+        assert (labels[seen] > 0).mean() > 0.9
+
+
+def test_two_blocks_are_two_regions_and_a_speck_is_none() -> None:
+    own = (square(10, 10, 12) | square(35, 55, 12) | square(5, 60, 3)).astype(np.uint8)
+    labels = moving_regions(own, [], [], CONFIG)
+    assert {labels[16, 16], labels[41, 61]} == {1, 2} == set(np.unique(labels)) - {0}
+    assert labels[6, 61] == 0
 
 
 def test_a_region_takes_its_commonest_depth() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -155,10 +156,11 @@ def test_an_array_takes_its_space_when_it_is_made(tmp_path: Path, monkeypatch: p
     path = kept.folder / "depth_0.npy"
     assert path.stat().st_blocks * 512 >= 5 * 16 * 24 * 4
 
-    def full(self: Path, mode: str) -> None:
+    def full(file: io.BufferedWriter, header: dict[str, object]) -> None:
+        file.write(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "open", full)
+    monkeypatch.setattr(np.lib.format, "write_array_header_1_0", full)
     with pytest.raises(ResultError, match=r"swept_0.npy: cannot be written \(No space left"):
         kept.create("swept")
     assert not (kept.folder / "swept_0.npy").exists()
