@@ -162,8 +162,8 @@ def _announce_refinement(tracked: Tracked, config: Config, writer: Reconstructio
     logger.info("refinement: %.0f MB of disk while it works, flow takes about %.0f s", disk / 1e6, seconds)
     if free < disk:
         raise ResultError(
-            f"{writer.folder}: the refinement works on {disk / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB"
-            " left; free space, then continue with --resume, or stay with --stage tracking"
+            f"{writer.folder}: the refinement works on {disk / 1e6:.0f} MB and the disk has"
+            f" {free / 1e6:.0f} MB left; free space and continue with --resume, or stay with --stage tracking"
         )
 
 

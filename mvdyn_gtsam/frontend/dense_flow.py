@@ -143,12 +143,15 @@ class DisFlow:
         """See ``DenseFlow.measure``."""
         return measure_both(self.flow, to_grey(image_i), to_grey(image_j), seed, seed_backward, self.config)
 
-    def flow(self, grey_i: Image, grey_j: Image) -> Float32:
-        """One direction ``(H, W, 2)`` between grey images of one size, no weights."""
+    def flow(self, grey_i: Image, grey_j: Image, halved: int = 0) -> Float32:
+        """One direction ``(H, W, 2)`` between grey images of one size, no weights.
+
+        Images that have been ``halved`` before need as many levels less of the pyramid.
+        """
         config = self.config
         # A new engine per call: it keeps buffers, and is neither thread-safe nor picklable.
         engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        engine.setFinestScale(config.finest_scale)
+        engine.setFinestScale(config.finest_scale - halved)
         engine.setPatchSize(config.patch_size)
         engine.setPatchStride(config.patch_stride)
         engine.setGradientDescentIterations(config.gradient_iterations)

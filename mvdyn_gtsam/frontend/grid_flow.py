@@ -30,8 +30,11 @@ class OneWayFlow(Protocol):
 
     config: FlowConfig
 
-    def flow(self, grey_i: Image, grey_j: Image) -> Float32:
-        """``(H, W, 2)`` px; safe to call from several threads."""
+    def flow(self, grey_i: Image, grey_j: Image, halved: int = 0) -> Float32:
+        """``(H, W, 2)`` px; safe to call from several threads.
+
+        ``halved`` is how often the images have been halved already, at most ``config.finest_scale`` times.
+        """
         ...
 
 
@@ -164,12 +167,32 @@ def _positions(seed: Float32) -> Float32:
 
 
 def _seeded(flow: OneWayFlow, grey_i: Image, grey_j: Image, seed: Float32) -> _OneWay:
-    height, width = grey_j.shape
-    warped = cv2.remap(grey_j, seed, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    seen = cv2.inRange(seed, (0.0, 0.0, 0.0, 0.0), (width - 1.0, height - 1.0, 0.0, 0.0))
+    """The flow never looks at levels finer than its finest: image j is warped at that level already."""
+    level = flow.config.finest_scale
+    size_i = grey_i.shape[1], grey_i.shape[0]
+    small_i, small_j = _shrunk(grey_i, level), _shrunk(grey_j, level)
+    target = _shrunk(seed, level)
+    scale = np.divide(small_j.shape[::-1], grey_j.shape[::-1]).astype(np.float32)
+    if level:
+        target = target * scale + (0.5 * scale - 0.5)
+    height, width = small_j.shape
+    warped = cv2.remap(small_j, target, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.inRange(target, (-0.5, -0.5, 0.0, 0.0), (width - 0.5, height - 0.5, 0.0, 0.0))
     # Where nothing is known the image itself stands in: no residual there, and no false edges.
-    cv2.copyTo(grey_i, cv2.bitwise_not(seen), warped)
-    return _OneWay(flow.flow(grey_i, np.asarray(warped, np.uint8)), seed, grey_j.shape)
+    cv2.copyTo(small_i, cv2.bitwise_not(seen), warped)
+    residual = flow.flow(small_i, np.asarray(warped, np.uint8), level)
+    if level:
+        back = np.divide(size_i, small_i.shape[::-1]).astype(np.float32)
+        residual = cv2.resize(residual, size_i, interpolation=cv2.INTER_LINEAR) * back
+    return _OneWay(residual, seed, grey_j.shape)
+
+
+def _shrunk(field: npt.NDArray[Any], level: int) -> npt.NDArray[Any]:
+    """``(H, W[, C])`` halved ``level`` times, as DIS does for its pyramid."""
+    for _ in range(level):
+        size = field.shape[1] // 2, field.shape[0] // 2
+        field = np.asarray(cv2.resize(field, size, interpolation=cv2.INTER_AREA))
+    return field
 
 
 def _sampled(one: _OneWay, other: _OneWay, grid: Grid, config: FlowConfig) -> GridFlow:

@@ -77,7 +77,7 @@ class RefinementConfig:
     of the static pixels are below 0.3 to 0.8 px and 90 % of the moving ones above 0.4 to 10 px."""
     moving_area: float = 0.003
     """Smallest region that may move, as a share of the image. Source: choice."""
-    moving_gap: float = 0.04
+    moving_gap: float = 0.06
     """Gaps in a moving region up to this share of the image's width are closed. Source: choice."""
     moving_share: float = 0.4
     """Share of the frames around that must see the static model fail. Source: choice."""

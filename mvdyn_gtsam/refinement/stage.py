@@ -24,7 +24,7 @@ from mvdyn_gtsam.refinement.poses import solve_poses
 from mvdyn_gtsam.refinement.samples import FrameSample, SampleStore
 from mvdyn_gtsam.refinement.scale import solve_scales
 from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.tasks import FIRST_DEPTH, Context, FinishedFrame, windows
+from mvdyn_gtsam.refinement.tasks import FIRST_DEPTH, GUIDE_STEPS, Context, FinishedFrame, windows
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
@@ -128,11 +128,11 @@ class Refinement:
                 self._step("begin", lambda: self._map("begin", self._frames))
                 self._step("settle", lambda: self._map("settle", self._frames))
                 self._depth = "begun"
-                self._solve_depth(FIRST_DEPTH)
+                self._solve_depth(FIRST_DEPTH, min(GUIDE_STEPS, config.depth_iterations))
                 self._step("wide flow", lambda: self._map("wide flow", self._across))
                 for number in range(1, config.rounds + 1):
                     self._step(f"poses {number}", self._solve_poses)
-                    self._solve_depth(f"depth {number}")
+                    self._solve_depth(f"depth {number}", config.depth_iterations)
         scales = self._workspace.read_array("scales")
         return Refined(self._context.poses(), scales[0], scales[1], self.seconds)
 
@@ -206,10 +206,10 @@ class Refinement:
             # an offset must not turn the nearest pixels inside out
             self._workspace.write("aligned", frame, 1.0 / np.maximum(moved, 0.1 * depth))
 
-    def _solve_depth(self, target: str) -> None:
+    def _solve_depth(self, target: str, steps: int) -> None:
         """Phase 2, depth: every window from what all windows had before, so that their order does not
         matter."""
-        jobs = windows(self._depth, target, self._frame_count, self._config.window)
+        jobs = windows(self._depth, target, self._frame_count, self._config.window, steps)
 
         def solve() -> None:
             self._workspace.create(target)

@@ -41,6 +41,8 @@ SAMPLE_SPACING = 16
 """Distance of the pixels that phase 1 and the poses see, px of the input."""
 FIRST_STEPS = 2
 """Gauss-Newton steps before it is asked what moves."""
+GUIDE_STEPS = 3
+"""Gauss-Newton steps of the depth that guides the flow between cameras; that flow improves it later."""
 
 FIRST_DEPTH = "depth 0"
 """The array of the first depth solve, from flow within cameras; it guides the flow between them."""
@@ -150,13 +152,14 @@ def settle_task(context: Context, frame: Frame) -> None:
     workspace.write("begun", frame, np.exp(theta))
 
 
-def window_task(context: Context, window: tuple[str, str, int, int]) -> None:
-    """Depth of all cameras between two times: ``(read from, write to, first, end)`` arrays and times.
+def window_task(context: Context, window: tuple[str, str, int, int, int]) -> None:
+    """Depth of all cameras between two times: ``(read from, write to, first, end, steps)``, arrays, times and
+    Gauss-Newton steps.
 
     Frames up to ``overlap`` steps outside are solved too, so that the window's ends see renewed neighbours,
     but are not kept: another window does.
     """
-    source, target, first, end = window
+    source, target, first, end, steps = window
     workspace, config = context.workspace, context.config
     wTc = context.poses()
     times = range(max(0, first - config.overlap), min(workspace.frame_count, end + config.overlap))
@@ -172,9 +175,7 @@ def window_task(context: Context, window: tuple[str, str, int, int]) -> None:
             }
             prior = DepthPrior(context.image("prior", frame), context.image("prior_weight", frame))
             theta, weights = np.log(context.image(source, frame)), _image_weights(context, frame)
-            theta, information = solve_frame(
-                theta, edges, others, weights, prior, config, config.depth_iterations
-            )
+            theta, information = solve_frame(theta, edges, others, weights, prior, config, steps)
             renewed[frame] = theta
             if first <= frame[1] < end:
                 workspace.write(target, frame, np.exp(theta))
@@ -326,6 +327,8 @@ TASKS = {
 }
 
 
-def windows(source: str, target: str, frame_count: int, length: int) -> Sequence[tuple[str, str, int, int]]:
+def windows(
+    source: str, target: str, frame_count: int, length: int, steps: int
+) -> Sequence[tuple[str, str, int, int, int]]:
     """Jobs of ``window_task`` that cover all times."""
-    return [(source, target, t, min(t + length, frame_count)) for t in range(0, frame_count, length)]
+    return [(source, target, t, min(t + length, frame_count), steps) for t in range(0, frame_count, length)]
