@@ -1,4 +1,4 @@
-"""Peak memory and time of `mvdyn reconstruct --stage tracking` against the length of the video.
+"""Peak memory and time of `mvdyn reconstruct` (by default `--stage tracking`) against the video's length.
 
 A long capture is made by playing a short one forwards and backwards (its images are written once and linked),
 cut to two cameras. Each length runs in a process of its own. Its peak resident memory is set against that of
@@ -86,7 +86,7 @@ def measure_libraries() -> float:
 
 
 def measure(
-    source: Path, cameras: int, length: int, overrides: Sequence[str], scratch: Path | None
+    source: Path, cameras: int, length: int, stage: str, overrides: Sequence[str], scratch: Path | None
 ) -> dict[str, Any]:
     """Reconstruct a capture of ``length`` frames and say what it took. Raises ExperimentError if it fails."""
     from mvdyn_gtsam.baselines.comparison import our_command
@@ -97,13 +97,14 @@ def measure(
     with tempfile.TemporaryDirectory(prefix="mvdyn-memory-", dir=scratch) as folder:
         capture, result, log = (Path(folder) / name for name in ("capture", "result", "log"))
         write_long_capture(load_capture(source), cameras, length, capture)
-        usage = run_measured(our_command(capture, result, "tracking", arguments), log)
+        usage = run_measured(our_command(capture, result, stage, arguments), log)
         if usage.problem is not None:
             raise ExperimentError(f"{source.name}, {length} frames: {usage.problem}")
         return {
             "capture": source.resolve().name,
             "cameras": cameras,
             "frames": length,
+            "stage": stage,
             "seconds": usage.seconds,
             "cpu_seconds": usage.cpu_seconds,
             "peak_mb": usage.peak_mb,
@@ -163,6 +164,8 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument("--frames", nargs="+", type=int, default=[150, 300],
                         help="lengths per camera (default: 150 300)")  # fmt: skip
     result.add_argument("--cameras", type=int, default=2, help="default: %(default)s")
+    result.add_argument("--stage", choices=("tracking", "refinement"), default="tracking",
+                        help="last stage to run (default: %(default)s)")  # fmt: skip
     result.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
                         help="change a setting")  # fmt: skip
     result.add_argument("--scratch", type=Path, metavar="DIR", help="for the long capture and its result")
@@ -184,12 +187,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = to_dict(load_config(None, options.overrides))
         name = options.capture.resolve().name
         for length in sorted(set(options.frames)):
-            key = key_of(capture=name, cameras=options.cameras, frames=length, settings=settings)
+            key = key_of(
+                capture=name, cameras=options.cameras, frames=length, stage=options.stage, settings=settings
+            )
             entry = None if options.again else records.find(key)
             if entry is None:
                 sys.stderr.write(f"{name}, {length} frames: running\n")
                 content = measure(
-                    options.capture, options.cameras, length, options.overrides, options.scratch
+                    options.capture,
+                    options.cameras,
+                    length,
+                    options.stage,
+                    options.overrides,
+                    options.scratch,
                 )
                 entry = records.add(key, content)
             else:
