@@ -208,6 +208,12 @@ def test_flow_of_little_weight_carries_no_vote(own_edges: list[Edge]) -> None:
         assert (labels[seen] > 0).mean() > 0.9
 
 
+def test_what_flows_out_of_the_image_has_no_vote(own_edges: list[Edge]) -> None:
+    gone = [replace(edge, nearest=np.full_like(edge.nearest, -1)) for edge in own_edges]
+    votes = [np.ones(VIEW.shape, np.uint8)] * len(gone)
+    assert (moving_regions(np.zeros(VIEW.shape, np.uint8), gone, votes, CONFIG) == 0).all()
+
+
 def test_two_blocks_are_two_regions_and_a_speck_is_none() -> None:
     own = (square(10, 10, 12) | square(35, 55, 12) | square(5, 60, 4)).astype(np.uint8)
     labels = moving_regions(own, [], [], CONFIG)
