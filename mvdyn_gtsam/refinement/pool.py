@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
+import signal
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -11,8 +15,11 @@ from types import TracebackType
 
 import cv2
 
-from mvdyn_gtsam.errors import ResultError
+from mvdyn_gtsam.errors import ConfigError, ResultError
 from mvdyn_gtsam.refinement.tasks import Context, run_task
+
+PARENT_CHECK_S = 1.0
+"""How often a worker looks whether the process it works for is still there."""
 
 _context: Context | None = None
 """Of a worker process: it serves one refinement and receives its context once."""
@@ -28,13 +35,23 @@ class TaskPool:
         self._executor: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> TaskPool:
+        """Raises ConfigError where the flow cannot travel to processes, ResultError where none starts."""
         if self._workers > 1:
+            try:
+                pickle.dumps(self._context)
+            except (pickle.PicklingError, TypeError, AttributeError) as error:
+                raise ConfigError(
+                    f"this flow cannot be sent to other processes ({error}); set refinement.workers=1"
+                ) from error
             threads = os.environ.get("OPENBLAS_NUM_THREADS")
             # read when numpy is imported: a worker is one of several
             os.environ["OPENBLAS_NUM_THREADS"] = "1"
             try:
                 self._executor = ProcessPoolExecutor(
-                    self._workers, multiprocessing.get_context("spawn"), _receive, (self._context,)
+                    self._workers,
+                    multiprocessing.get_context("spawn"),
+                    _receive,
+                    (self._context, os.getpid()),
                 )
                 # processes start with the first job; they must see the variable
                 list(self._executor.map(_ready, range(self._workers)))
@@ -90,10 +107,20 @@ def _broken() -> ResultError:
     )
 
 
-def _receive(context: Context) -> None:
+def _receive(context: Context, parent: int) -> None:
     global _context  # noqa: PLW0603 - the one way to hand a worker what all its jobs share
     _context = context
     cv2.setNumThreads(1)
+    # Ctrl-C reaches every process of the terminal: the parent alone says so and ends the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+
+
+def _leave_with(parent: int) -> None:
+    """End this worker when its parent was killed: nobody would ever send it another job."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_CHECK_S)
+    os._exit(1)
 
 
 def _ready(_: int) -> None:
