@@ -67,11 +67,11 @@ class FlowThatStops(DisFlow):
         super().__init__()
         self.left = count
 
-    def flow(self, grey_i: Image, grey_j: Image) -> Float32:
+    def flow(self, grey_i: Image, grey_j: Image, halved: int = 0) -> Float32:
         self.left -= 1
         if self.left < 0:
             raise StoppedError
-        return super().flow(grey_i, grey_j)
+        return super().flow(grey_i, grey_j, halved)
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from mvdyn_gtsam.errors import ResultError
 from mvdyn_gtsam.graph.connections import Frame
 
 Array = npt.NDArray[np.float64]
@@ -42,10 +43,17 @@ class SampleStore:
         self._path = path
 
     def write(self, samples: Iterable[FrameSample]) -> None:
-        """Replace what the file holds."""
+        """Replace what the file holds. Raises ResultError when the disk is full."""
         with self._path.open("wb") as file:
             for sample in samples:
-                pickle.dump(sample, file, protocol=pickle.HIGHEST_PROTOCOL)
+                try:
+                    pickle.dump(sample, file, protocol=pickle.HIGHEST_PROTOCOL)
+                    file.flush()
+                except OSError as error:
+                    raise ResultError(
+                        f"{self._path}: cannot be written ({error.strerror}); free space, then continue with"
+                        " --resume"
+                    ) from error
 
     def read(self) -> Iterator[FrameSample]:
         """The samples in the order written, one in memory at a time."""

@@ -53,7 +53,7 @@ class RefinementConfig:
     """``lambda`` of the flow's confidence: residual at which it begins to fall, px. Source: choice."""
     disparity_lambda: float = 0.05
     """The same for L_disp, relative depth. Source: choice."""
-    smoothness: float = 2.0
+    smoothness: float = 1.0
     """Weight of a change of log depth by ``smoothness_scale`` between neighbours, where the image is flat.
     Source: choice."""
     smoothness_scale: float = 0.01
@@ -97,7 +97,7 @@ class RefinementConfig:
                 raise ConfigError(f"refinement.{name} is {getattr(self, name)}; it must be at least {low}")
         for name in (
             "flow_lambda", "disparity_lambda", "smoothness_scale", "edge_contrast", "prior_rotation_deg",
-            "prior_translation",
+            "prior_translation", "prior_sigma", "moving_sigma", "moving_px",
         ):  # fmt: skip
             if not getattr(self, name) > 0.0:
                 raise ConfigError(f"refinement.{name} is {getattr(self, name)}; it must be above 0")

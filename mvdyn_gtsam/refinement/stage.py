@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
@@ -116,7 +116,8 @@ class Refinement:
     def run(self) -> Refined:
         """Everything but handing out the frames; what an earlier run finished is not done again."""
         config = self._config
-        self._workspace.prepare(repr((config, self._context.flow_config)))
+        # the number of processes decides nothing
+        self._workspace.prepare(repr((replace(config, workers=0), self._context.flow_config)))
         self._step("images", self._store_images)
         with TaskPool(self._context, config.workers) as pool:
             self._pool = pool

@@ -39,6 +39,8 @@ TRUSTED_SIGMA = 0.05
 surroundings'."""
 SAMPLE_SPACING = 16
 """Distance of the pixels that phase 1 and the poses see, px of the input."""
+LEAST_TRUST = 0.05
+"""Of the best pixel of a frame; below, there is nothing to continue into the rest."""
 FIRST_STEPS = 2
 """Gauss-Newton steps before it is asked what moves."""
 GUIDE_STEPS = 3
@@ -134,8 +136,12 @@ def settle_task(context: Context, frame: Frame) -> None:
     trust[labels > 0] = 0.0
     # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
     # an average of depth cubed leans to the far side
-    cubed = filled(np.exp(-3.0 * theta).astype(np.float32), trust)
-    theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
+    if trust.max() > LEAST_TRUST:
+        cubed = filled(np.exp(-3.0 * theta).astype(np.float32), trust)
+        theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
+    else:
+        # a camera that stands still has no parallax of its own: the others' flow will tell
+        theta = np.log(context.image("aligned", frame))
     moving = np.where(labels > 0, UNEXPLAINED, STATIC).astype(np.uint8)
     instant = context.image("instant", frame)
     for label in np.unique(labels[labels > 0]) if len(context.group_of(frame[0])) > 1 else ():
@@ -269,7 +275,8 @@ def _median_residuals(edges: Sequence[Edge], inverse_depth: Float32) -> dict[int
     residuals: dict[int, list[Float32]] = {}
     for edge in edges:
         sure = edge.weight >= SURE_WEIGHT
-        residual = edge.terms(inverse_depth.ravel()[edge.pixels]).residual[sure]
+        terms = edge.terms(inverse_depth.ravel()[edge.pixels])
+        residual = terms.residual[sure & terms.valid]
         residuals.setdefault(edge.j[0], []).append(np.hypot(residual[:, 0], residual[:, 1]))
     return {
         camera: float(np.median(np.concatenate(values)))

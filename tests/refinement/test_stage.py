@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,3 +95,23 @@ def test_a_finished_run_does_nothing_again(tmp_path: Path) -> None:
     np.testing.assert_array_equal(before.wTc, after.wTc)
     for one, other in zip(first.frames(), second.frames(), strict=True):
         np.testing.assert_array_equal(one.depth, other.depth)
+
+
+def test_a_camera_that_stands_still_keeps_its_tracked_depth(tmp_path: Path) -> None:
+    wTc, covariance = np.tile(np.eye(4), (1, 4, 1, 1)), np.full((1, 4, 6, 6), np.nan)
+    tracked = Tracked((CAMERA,), ((0,),), wTc, covariance, (), read, depth)
+    still = EvenFlow()
+    made = Refinement(tracked, tmp_path / "work", CONFIG, still, FlowConfig(), NullProgress())
+    made.run()
+    for frame in made.frames():
+        np.testing.assert_allclose(frame.depth, 3.0, rtol=0.05)
+
+
+def test_another_number_of_processes_goes_on_with_the_same_work(tmp_path: Path) -> None:
+    refinement(tmp_path / "work", EvenFlow()).run()
+    workspace = Workspace(tmp_path / "work", (DenseView.of(CAMERA, 1.0 / CONFIG.stride),), 4)
+    before = workspace.finished()
+    workspace.prepare(repr((replace(CONFIG, workers=0), FlowConfig())))
+    assert workspace.finished() == before
+    workspace.prepare(repr((replace(CONFIG, workers=0, rounds=3), FlowConfig())))
+    assert workspace.finished() == []
