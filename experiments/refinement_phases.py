@@ -56,9 +56,13 @@ COLUMNS = (
 )
 
 
-def measure(capture: Path, variant: str, work: Path, overrides: Sequence[str]) -> dict[str, Any]:
+def measure(
+    capture: Path, variant: str, work: Path, kept: Path | None, overrides: Sequence[str]
+) -> dict[str, Any]:
     """Track where that was not done yet, refine a copy, score it."""
     tracked = work / capture.resolve().name / "tracking"
+    if kept is not None and not tracked.exists():
+        shutil.copytree(kept / capture.resolve().name / "ours" / "ours", tracked)
     usage = _track(capture, tracked)
     folder, seconds = tracked, {}
     if variant != "tracking":
@@ -137,6 +141,8 @@ def parser() -> argparse.ArgumentParser:
                         help="change a setting of the refinement")  # fmt: skip
     result.add_argument("--work", type=Path, default=ROOT / "out" / NAME, metavar="DIR",
                         help="where reconstructions go (default: out/refinement_phases)")  # fmt: skip
+    result.add_argument("--kept", type=Path, metavar="WORK",
+                        help="take the tracking that experiments.accuracy left here")  # fmt: skip
     add_common_arguments(result)
     return result
 
@@ -155,7 +161,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             entry = None if options.again else records.find(key)
             if entry is None:
                 sys.stderr.write(f"{capture.name}, {variant}: running\n")
-                entry = records.add(key, measure(capture, variant, options.work, options.overrides))
+                entry = records.add(
+                    key, measure(capture, variant, options.work, options.kept, options.overrides)
+                )
             else:
                 sys.stderr.write(f"{capture.name}, {variant}: kept from commit {entry['commit']}\n")
             entries.append(entry)
