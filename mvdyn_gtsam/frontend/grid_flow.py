@@ -171,10 +171,10 @@ def _seeded(flow: OneWayFlow, grey_i: Image, grey_j: Image, seed: Float32) -> _O
     level = flow.config.finest_scale
     size_i = grey_i.shape[1], grey_i.shape[0]
     small_i, small_j = _shrunk(grey_i, level), _shrunk(grey_j, level)
-    target = _shrunk(seed, level)
-    scale = np.divide(small_j.shape[::-1], grey_j.shape[::-1]).astype(np.float32)
+    target = seed
     if level:
-        target = target * scale + (0.5 * scale - 0.5)
+        x, y = np.divide(small_j.shape[::-1], grey_j.shape[::-1])
+        target = cv2.transform(_shrunk(seed, level), np.array([[x, 0, 0.5 * x - 0.5], [0, y, 0.5 * y - 0.5]]))
     height, width = small_j.shape
     warped = cv2.remap(small_j, target, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     seen = cv2.inRange(target, (-0.5, -0.5, 0.0, 0.0), (width - 0.5, height - 0.5, 0.0, 0.0))
@@ -182,8 +182,8 @@ def _seeded(flow: OneWayFlow, grey_i: Image, grey_j: Image, seed: Float32) -> _O
     cv2.copyTo(small_i, cv2.bitwise_not(seen), warped)
     residual = flow.flow(small_i, np.asarray(warped, np.uint8), level)
     if level:
-        back = np.divide(size_i, small_i.shape[::-1]).astype(np.float32)
-        residual = cv2.resize(residual, size_i, interpolation=cv2.INTER_LINEAR) * back
+        residual = cv2.multiply(residual, (*np.divide(size_i, small_i.shape[::-1]), 1.0, 1.0))
+        residual = np.asarray(cv2.resize(residual, size_i, interpolation=cv2.INTER_LINEAR), np.float32)
     return _OneWay(residual, seed, grey_j.shape)
 
 

@@ -8,6 +8,7 @@ scored by how much *different* structure they explain, several are kept, and non
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,9 @@ from mvdyn_gtsam.geometry import Similarity, invert_pose, rotation_angle_deg
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+
+DIFFERENCE = 1e-6
+"""Step of the refinement's numerical derivatives: radians, median depths, log scale."""
 
 
 @dataclass(frozen=True)
@@ -182,11 +186,22 @@ def _fit(aSb: Similarity, scorer: PlacementScorer) -> Similarity:
         return Similarity(aSb.scale * float(np.exp(step[6])), rotation, aSb.translation + step[3:6])
 
     def residuals(step: Array) -> Array:
-        both = np.concatenate(scorer.residuals(moved(step)), axis=-1).ravel()
-        return np.clip(np.nan_to_num(both, nan=1e3), -1e3, 1e3)
+        return _bounded(np.concatenate(scorer.residuals(moved(step)), axis=-1)).ravel()
 
-    solution = least_squares(residuals, np.zeros(7), loss="soft_l1", f_scale=1.0, max_nfev=20)
+    def jacobian(step: Array) -> Array:
+        """Forward differences, all seven at once: least_squares would ask for one after the other."""
+        steps = DIFFERENCE * np.maximum(1.0, np.abs(step))
+        placements = [moved(step), *(moved(step + row) for row in np.diag(steps))]
+        found = _bounded(np.concatenate(scorer.residuals_of_many(placements), axis=-1))
+        found = found.reshape(len(placements), -1)
+        return ((found[1:] - found[0]) / steps[:, None]).T
+
+    solution = least_squares(residuals, np.zeros(7), jacobian, loss="soft_l1", f_scale=1.0, max_nfev=20)
     return moved(solution.x)
+
+
+def _bounded(residuals: Array) -> Array:
+    return np.clip(np.nan_to_num(residuals, nan=1e3), -1e3, 1e3)
 
 
 class PlacementScorer:
@@ -205,6 +220,15 @@ class PlacementScorer:
         matches = self.matches
         in_a = _reproject(aSb.transform_points(matches.point_b), matches.aTm, self.intrinsics_a)
         in_b = _reproject(aSb.inverse().transform_points(matches.point_a), matches.bTm, self.intrinsics_b)
+        return in_a - matches.pixel_a, in_b - matches.pixel_b
+
+    def residuals_of_many(self, aSb: Sequence[Similarity]) -> tuple[Array, Array]:
+        """``(H, M, 2)`` px each: the ``residuals`` of H placements."""
+        matches = self.matches
+        b_in_a = np.stack([one.transform_points(matches.point_b) for one in aSb])
+        a_in_b = np.stack([one.inverse().transform_points(matches.point_a) for one in aSb])
+        in_a = _reproject(b_in_a, matches.aTm, self.intrinsics_a)
+        in_b = _reproject(a_in_b, matches.bTm, self.intrinsics_b)
         return in_a - matches.pixel_a, in_b - matches.pixel_b
 
     def errors(self, aSb: Similarity) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -44,6 +45,35 @@ def test_dis_can_measure_one_direction_alone() -> None:
     assert isinstance(DisFlow(), OneWayFlow)
 
 
+def test_halved_images_need_one_level_less() -> None:
+    image, moved = texture((96, 128)), warped(np.array([[1, 0, 3.0], [0, 1, -2.0], [0, 0, 1]]), (96, 128))
+    small = [np.asarray(cv2.resize(one, (64, 48), interpolation=cv2.INTER_AREA)) for one in (image, moved)]
+    flow = DisFlow(FlowConfig(finest_scale=1))
+    whole, halved = flow.flow(image, moved), 2.0 * flow.flow(small[0], small[1], 1)
+    inner = np.s_[8:-8, 8:-8]
+    np.testing.assert_allclose(cv2.resize(halved, (128, 96))[inner], whole[inner], atol=0.02)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_seeded_flow_is_true_at_any_finest_level(level: int) -> None:
+    motion = np.array([[1.02, 0.01, 7.3], [-0.01, 1.01, -5.6], [0, 0, 1]])
+    image, moved = texture((161, 221)), warped(motion, (161, 221))
+    grid = Grid.covering(221, 161, 8)
+    x, y = np.meshgrid(np.arange(221.0), np.arange(161.0))
+    forward, backward = (
+        np.dstack([m[0, 0] * x + m[0, 1] * y + m[0, 2] - x, m[1, 0] * x + m[1, 1] * y + m[1, 2] - y])
+        for m in (motion, np.linalg.inv(motion))
+    )
+    flow = DisFlow(FlowConfig(finest_scale=level))
+    seeds = [(field + 0.7).astype(np.float32) for field in (forward, backward)]
+    found = measure_grid_seeded(flow, image, moved, grid, grid, *seeds)
+    for one, truth in zip(found, (forward, backward), strict=True):
+        trusted = one.weight > 0.5
+        assert trusted.mean() > 0.5
+        error = np.linalg.norm(one.target - grid.pixels - grid.sample(truth), axis=1)[trusted]
+        assert np.median(error) < 0.15
+
+
 def test_plain_flow_is_the_dense_one_at_the_grid() -> None:
     image, moved = texture((96, 128)), warped(np.array([[1, 0, 3.0], [0, 1, -2.0], [0, 0, 1]]), (96, 128))
     flow, grid, other = DisFlow(), Grid.covering(128, 96, 8), Grid.covering(128, 96, 5)
@@ -58,7 +88,8 @@ def test_plain_flow_is_the_dense_one_at_the_grid() -> None:
 
 def test_seeded_flow_is_the_dense_one_at_the_grid(views: tuple[View, View]) -> None:
     i, j = views
-    jTi, flow = invert_pose(j.wTc) @ i.wTc, DisFlow()
+    # at level 0: otherwise the dense one still warps at full resolution, and this one does not
+    jTi, flow = invert_pose(j.wTc) @ i.wTc, DisFlow(FlowConfig(finest_scale=0))
     seed_i = predicted_flow(i.depth, i.intrinsics, j.intrinsics, jTi, j.shape)
     seed_j = predicted_flow(j.depth, j.intrinsics, i.intrinsics, invert_pose(jTi), i.shape)
     grids = (Grid.covering(i.shape[1], i.shape[0], 7), Grid.covering(j.shape[1], j.shape[0], 7))
@@ -70,12 +101,13 @@ def test_seeded_flow_is_the_dense_one_at_the_grid(views: tuple[View, View]) -> N
 
 def test_guided_flow_is_the_dense_one_at_the_grid(views: tuple[View, View]) -> None:
     i, j = views
-    jTi, config = invert_pose(j.wTc) @ i.wTc, FlowConfig()
+    jTi, config = invert_pose(j.wTc) @ i.wTc, FlowConfig(finest_scale=0)
     a, b = grid_view(i, 4), grid_view(j, 4)
     depth_i, depth_j = (v.grid.expand(v.depth, *v.size) for v in (a, b))
-    pair = guided_flow(DisFlow(), i.image, j.image, depth_i, depth_j, i.intrinsics, j.intrinsics, jTi, config)
+    flow = DisFlow(config)
+    pair = guided_flow(flow, i.image, j.image, depth_i, depth_j, i.intrinsics, j.intrinsics, jTi, config)
     dense = sample_pair(pair, a.grid, b.grid)
-    for one, expected in zip(guide_grid(DisFlow(), i.image, j.image, a, b, jTi, config), dense, strict=True):
+    for one, expected in zip(guide_grid(flow, i.image, j.image, a, b, jTi, config), dense, strict=True):
         agree(one, expected, 0.1)
 
 
