@@ -13,12 +13,9 @@ from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.reconstruction.export.images import image_name, write_image
 from mvdyn_gtsam.reconstruction.export.points import (
     FramePoints,
-    check_capture,
-    check_times,
-    frame_points,
+    checked_times,
+    group_points,
     placed_groups,
-    posed_frames,
-    read_image,
 )
 from mvdyn_gtsam.reconstruction.files import write_atomically
 from mvdyn_gtsam.reconstruction.result import Reconstruction
@@ -43,37 +40,23 @@ def export_colmap(
     image. Poses become camera-to-world's inverse and pixels move by half a pixel, as COLMAP wants.
     Returns the folders of the models, one per group (groups do not share a world frame).
     """
-    chosen = set(check_times(reconstruction, times))
-    if capture is not None:
-        check_capture(reconstruction, capture)
+    chosen = checked_times(reconstruction, times, capture)
     models = []
     for index, group in enumerate(placed_groups(reconstruction)):
         images = [
             "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then X Y POINT3D_ID ...; +0.5 px centres\n"
         ]
         points = ["# POINT3D_ID X Y Z R G B ERROR TRACK (IMAGE_ID POINT2D_IDX)\n"]
-        image_id = 0
-        for camera in group:
-            camera_id = reconstruction.cameras.index(camera) + 1
-            for time, wTc in posed_frames(reconstruction, camera):
-                if time not in chosen:
-                    continue
-                image_id += 1
-                image = None if capture is None else read_image(capture, camera, time)
-                seen = frame_points(
-                    reconstruction,
-                    camera,
-                    time,
-                    wTc,
-                    stride=stride,
-                    min_confidence=min_confidence,
-                    image=image,
-                )
-                first = len(points)
-                images.append(_image_lines(image_id, camera_id, wTc, seen, first))
-                points += _point_lines(image_id, seen, first)
-                if capture is not None:
-                    write_image(capture, camera, time, folder / "images")
+        frames = group_points(
+            reconstruction, group, chosen, capture, stride=stride, min_confidence=min_confidence
+        )
+        for image_id, seen in enumerate(frames, start=1):
+            camera_id = reconstruction.cameras.index(seen.camera) + 1
+            first = len(points)
+            images.append(_image_lines(image_id, camera_id, seen, first))
+            points += _point_lines(image_id, seen, first)
+            if capture is not None:
+                write_image(capture, seen.camera, seen.time, folder / "images")
         model = folder / "sparse" / str(index)
         cameras = [_camera_line(reconstruction.cameras.index(c) + 1, reconstruction.camera(c)) for c in group]
         write_atomically(model / "cameras.txt", "".join(cameras).encode())
@@ -88,8 +71,8 @@ def _camera_line(camera_id: int, camera: Camera) -> str:
     return f"{camera_id} PINHOLE {camera.width} {camera.height} " + _join(numbers) + "\n"
 
 
-def _image_lines(image_id: int, camera_id: int, wTc: np.ndarray, seen: FramePoints, first_point: int) -> str:
-    cTw = invert_pose(wTc)
+def _image_lines(image_id: int, camera_id: int, seen: FramePoints, first_point: int) -> str:
+    cTw = invert_pose(seen.wTc)
     qx, qy, qz, qw = Rotation.from_matrix(cTw[:3, :3]).as_quat(canonical=True)
     name = image_name(seen.camera, seen.time)
     pixels = seen.pixels + PIXEL_CENTRE

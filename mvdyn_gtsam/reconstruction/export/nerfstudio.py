@@ -11,14 +11,7 @@ import numpy as np
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.reconstruction.export.images import image_name, write_image
 from mvdyn_gtsam.reconstruction.export.ply import points_to_ply
-from mvdyn_gtsam.reconstruction.export.points import (
-    check_capture,
-    check_times,
-    frame_points,
-    placed_groups,
-    posed_frames,
-    read_image,
-)
+from mvdyn_gtsam.reconstruction.export.points import checked_times, group_points, placed_groups
 from mvdyn_gtsam.reconstruction.files import write_json
 from mvdyn_gtsam.reconstruction.result import Reconstruction
 
@@ -43,9 +36,7 @@ def export_nerfstudio(
     ``fl_x .. h``, ``time`` in [0, 1] as the dynamic dataparsers (D-NeRF, 4D-GS) read it, ``timestamp`` in
     seconds and ``camera``. With several groups, ``group<i>/transforms.json``. Returns the JSON files.
     """
-    chosen = set(check_times(reconstruction, times))
-    if capture is not None:
-        check_capture(reconstruction, capture)
+    chosen = checked_times(reconstruction, times, capture)
     groups = placed_groups(reconstruction)
     written = []
     for index, group in enumerate(groups):
@@ -53,25 +44,14 @@ def export_nerfstudio(
         frames: list[dict[str, Any]] = []
         positions = [np.empty((0, 3))]
         colours = [np.empty((0, 3), np.uint8)]
-        for camera in group:
-            for time, wTc in posed_frames(reconstruction, camera):
-                if time not in chosen:
-                    continue
-                frames.append(_frame(reconstruction, camera, time, wTc))
-                image = None if capture is None else read_image(capture, camera, time)
-                seen = frame_points(
-                    reconstruction,
-                    camera,
-                    time,
-                    wTc,
-                    stride=stride,
-                    min_confidence=min_confidence,
-                    image=image,
-                )
-                positions.append(seen.positions)
-                colours.append(seen.colours)
-                if capture is not None:
-                    write_image(capture, camera, time, target / "images")
+        for seen in group_points(
+            reconstruction, group, chosen, capture, stride=stride, min_confidence=min_confidence
+        ):
+            frames.append(_frame(reconstruction, seen.camera, seen.time, seen.wTc))
+            positions.append(seen.positions)
+            colours.append(seen.colours)
+            if capture is not None:
+                write_image(capture, seen.camera, seen.time, target / "images")
         points_to_ply(target / "points.ply", np.concatenate(positions), np.concatenate(colours))
         path = target / "transforms.json"
         write_json(path, {"camera_model": "OPENCV", "ply_file_path": "points.ply", "frames": frames})

@@ -10,14 +10,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.errors import ResultError
-from mvdyn_gtsam.reconstruction.export.points import (
-    check_capture,
-    check_times,
-    frame_points,
-    placed_groups,
-    posed_frames,
-    read_image,
-)
+from mvdyn_gtsam.reconstruction.export.points import checked_times, group_points, placed_groups
 from mvdyn_gtsam.reconstruction.files import write_atomically
 from mvdyn_gtsam.reconstruction.result import Reconstruction
 
@@ -38,23 +31,17 @@ def export_ply(
     World coordinates (OpenCV axes of the world frame) in the reconstruction's unit. With several groups,
     ``<stem>_group<i>.ply``. Raises ResultError when no pixel passes ``min_confidence``. Returns the files.
     """
-    chosen = set(check_times(reconstruction, times))
-    if capture is not None:
-        check_capture(reconstruction, capture)
+    chosen = checked_times(reconstruction, times, capture)
     groups = placed_groups(reconstruction)
     written = []
     for index, group in enumerate(groups):
         target = file if len(groups) == 1 else file.with_name(f"{file.stem}_group{index}.ply")
-        parts = []
-        for camera in group:
-            for time, wTc in posed_frames(reconstruction, camera):
-                if time in chosen:
-                    image = None if capture is None else read_image(capture, camera, time)
-                    points = frame_points(
-                        reconstruction, camera, time, wTc,
-                        stride=stride, min_confidence=min_confidence, image=image,
-                    )  # fmt: skip
-                    parts.append(_vertices(points.positions, points.colours))
+        parts = [
+            _vertices(seen.positions, seen.colours)
+            for seen in group_points(
+                reconstruction, group, chosen, capture, stride=stride, min_confidence=min_confidence
+            )
+        ]
         vertices = np.concatenate(parts) if parts else np.empty(0, _VERTEX)
         if not len(vertices):
             raise ResultError(

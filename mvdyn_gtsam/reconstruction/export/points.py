@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,8 @@ class FramePoints:
 
     camera: str
     time: int
+    wTc: npt.NDArray[np.float64]
+    """``(4, 4)``"""
     positions: npt.NDArray[np.float64]
     """``(N, 3)`` world, the reconstruction's unit."""
     pixels: npt.NDArray[np.float64]
@@ -65,6 +67,35 @@ def check_capture(reconstruction: Reconstruction, capture: Capture) -> None:
             )
 
 
+def checked_times(
+    reconstruction: Reconstruction, times: Sequence[int] | None, capture: Capture | None
+) -> set[int]:
+    """``times``, or every frame when None. Raises ResultError for a frame or a capture that does not fit."""
+    if capture is not None:
+        check_capture(reconstruction, capture)
+    return set(check_times(reconstruction, times))
+
+
+def group_points(
+    reconstruction: Reconstruction,
+    group: Sequence[str],
+    times: set[int],
+    capture: Capture | None,
+    *,
+    stride: int,
+    min_confidence: float,
+) -> Iterator[FramePoints]:
+    """Points of every frame of ``group`` at ``times`` that has a pose, grey without a capture."""
+    for camera in group:
+        for time, wTc in posed_frames(reconstruction, camera):
+            if time in times:
+                image = None if capture is None else read_image(capture, camera, time)
+                yield frame_points(
+                    reconstruction, camera, time, wTc,
+                    stride=stride, min_confidence=min_confidence, image=image,
+                )  # fmt: skip
+
+
 def read_image(capture: Capture, camera: str, time: int) -> npt.NDArray[np.uint8]:
     """Frame ``time`` of the camera called ``camera``, ``(H, W, 3) uint8`` RGB."""
     index = [item.name for item in capture.cameras].index(camera)
@@ -92,7 +123,7 @@ def frame_points(
     z = depth[rows, columns].astype(np.float64)
     positions = transform_points(wTc, backproject(pixels, z, reconstruction.intrinsics(camera)))
     colours = np.full((len(z), 3), 128, np.uint8) if image is None else image[rows * stride, columns * stride]
-    return FramePoints(camera, time, positions, pixels, colours)
+    return FramePoints(camera, time, wTc, positions, pixels, colours)
 
 
 def check_times(reconstruction: Reconstruction, times: Sequence[int] | None) -> list[int]:
