@@ -12,23 +12,23 @@ import argparse
 import itertools
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from experiments.records import (
     RESULTS,
     ROOT,
-    Records,
+    Page,
+    Run,
     captures_or_rendered,
     figure,
     finite,
     key_of,
-    page,
+    run_experiment,
     table,
-    write_text,
 )
 from mvdyn_gtsam.config import load_config, to_dict
-from mvdyn_gtsam.errors import MvdynError
 
 NAME = "accuracy"
 OURS = "ours"
@@ -223,32 +223,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run what is missing, print the table, write it after every run."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     options = parser().parse_args(words)
-    entries: list[dict[str, Any]] = []
-    try:
-        captures = captures_or_rendered(options.captures)
-        records = Records(options.results / f"{NAME}.json")
-        path = options.results / f"{options.name}.md"
-        for capture, method in itertools.product(captures, options.methods):
-            key = run_key(capture, method, options.stage, options.overrides)
-            entry = None if method in options.again else records.find(key)
-            if entry is None:
-                sys.stderr.write(f"{capture.name}, {method}: running\n")
-                content = measure(
-                    capture, method, options.stage, options.overrides, options.work, options.timeout
-                )
-                entry = records.add(key, content)
-            else:
-                sys.stderr.write(f"{capture.name}, {method}: kept from commit {entry['commit']}\n")
-            entries.append(entry)
-            write_text(path, page("Accuracy, time and memory", NAME, words, render(entries)))
-            best = page("Ours against the better baseline", NAME, words, render_best(entries))
-            write_text(path.with_stem(f"{path.stem}_against_best"), best)
-    except MvdynError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    sys.stdout.write(render(entries) + "\n" + render_best(entries))
-    sys.stderr.write(f"written: {path}\n")
-    return 0
+    stage, overrides = options.stage, options.overrides
+
+    def plan() -> list[Run]:
+        return [
+            Run(
+                label=f"{capture.name}, {method}",
+                key=run_key(capture, method, stage, overrides),
+                measure=partial(measure, capture, method, stage, overrides, options.work, options.timeout),
+                again=method in options.again,
+            )
+            for capture, method in itertools.product(captures_or_rendered(options.captures), options.methods)
+        ]
+
+    path = options.results / f"{options.name}.md"
+    pages = [
+        Page(path, "Accuracy, time and memory", render),
+        Page(path.with_stem(f"{path.stem}_against_best"), "Ours against the better baseline", render_best),
+    ]
+    return run_experiment(NAME, words, options.results / f"{NAME}.json", pages, plan)
 
 
 if __name__ == "__main__":

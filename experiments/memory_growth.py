@@ -15,23 +15,23 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from experiments.records import (
     RENDERED,
     ExperimentError,
-    Records,
+    Page,
+    Run,
     add_common_arguments,
     figure,
     key_of,
-    page,
+    run_experiment,
     table,
-    write_text,
 )
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import load_config, to_dict
-from mvdyn_gtsam.errors import MvdynError
 
 NAME = "memory_growth"
 GOAL_MB = 1500.0
@@ -181,37 +181,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = command_line.parse_args(words)
     if min(options.frames) < 2 or options.cameras < 1:
         command_line.error("--frames must be at least 2 and --cameras at least 1")
-    entries: list[dict[str, Any]] = []
-    try:
-        records, path = Records(options.results / f"{NAME}.json"), options.results / f"{options.name}.md"
+    name, cameras, stage = options.capture.resolve().name, options.cameras, options.stage
+
+    def plan() -> list[Run]:
         settings = to_dict(load_config(None, options.overrides))
-        name = options.capture.resolve().name
-        for length in sorted(set(options.frames)):
-            key = key_of(
-                capture=name, cameras=options.cameras, frames=length, stage=options.stage, settings=settings
+        return [
+            Run(
+                label=f"{name}, {length} frames",
+                key=key_of(capture=name, cameras=cameras, frames=length, stage=stage, settings=settings),
+                measure=partial(
+                    measure, options.capture, cameras, length, stage, options.overrides, options.scratch
+                ),
+                again=options.again,
             )
-            entry = None if options.again else records.find(key)
-            if entry is None:
-                sys.stderr.write(f"{name}, {length} frames: running\n")
-                content = measure(
-                    options.capture,
-                    options.cameras,
-                    length,
-                    options.stage,
-                    options.overrides,
-                    options.scratch,
-                )
-                entry = records.add(key, content)
-            else:
-                sys.stderr.write(f"{name}, {length} frames: kept from commit {entry['commit']}\n")
-            entries.append(entry)
-            write_text(path, page("Memory and time against length", NAME, words, render(entries)))
-    except MvdynError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    sys.stdout.write(render(entries))
-    sys.stderr.write(f"written: {path}\n")
-    return 0
+            for length in sorted(set(options.frames))
+        ]
+
+    pages = [Page(options.results / f"{options.name}.md", "Memory and time against length", render)]
+    return run_experiment(NAME, words, options.results / f"{NAME}.json", pages, plan)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,9 @@ import os
 import platform
 import shlex
 import subprocess
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +136,56 @@ def page(title: str, module: str, arguments: Sequence[str], body: str) -> str:
 def finite(value: float | None) -> float | None:
     """None for NaN and infinity, which JSON does not have."""
     return value if value is not None and math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of an experiment."""
+
+    label: str
+    """What to call it while it runs."""
+    key: str
+    """Of its entry in the records."""
+    measure: Callable[[], Mapping[str, Any]]
+    """Does it, where the records have no such entry."""
+    again: bool = False
+    """Do it even so."""
+    shown_as: Mapping[str, Any] = field(default_factory=dict)
+    """Put in place of what the entry holds when it is shown."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A results page that grows with every run."""
+
+    path: Path
+    title: str
+    render: Callable[[Sequence[Mapping[str, Any]]], str]
+
+
+def run_experiment(
+    module: str, words: Sequence[str], records: Path, pages: Sequence[Page], plan: Callable[[], Sequence[Run]]
+) -> int:
+    """Do the runs of ``plan`` that ``records`` lacks and write the pages after each; returns the exit code."""
+    entries: list[dict[str, Any]] = []
+    try:
+        kept = Records(records)
+        for run in plan():
+            entry = None if run.again else kept.find(run.key)
+            if entry is None:
+                sys.stderr.write(f"{run.label}: running\n")
+                entry = kept.add(run.key, run.measure())
+            else:
+                sys.stderr.write(f"{run.label}: kept from commit {entry['commit']}\n")
+            entries.append({**entry, **run.shown_as})
+            for item in pages:
+                write_text(item.path, page(item.title, module, words, item.render(entries)))
+    except MvdynError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    sys.stdout.write("\n".join(item.render(entries) for item in pages))
+    sys.stderr.write(f"written: {', '.join(str(item.path) for item in pages)}\n")
+    return 0
 
 
 def captures_or_rendered(folders: Sequence[Path]) -> list[Path]:

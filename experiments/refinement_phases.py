@@ -12,23 +12,23 @@ import itertools
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from experiments.records import (
     ROOT,
     ExperimentError,
-    Records,
+    Page,
+    Run,
     add_common_arguments,
     captures_or_rendered,
     figure,
     key_of,
-    page,
+    run_experiment,
     table,
-    write_text,
 )
 from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
-from mvdyn_gtsam.errors import MvdynError
 from mvdyn_gtsam.reconstruction import Reconstruction
 
 NAME = "refinement_phases"
@@ -151,29 +151,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run what is missing, print the table, write it after every run."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     options = parser().parse_args(words)
-    entries: list[dict[str, Any]] = []
-    try:
-        captures = captures_or_rendered(options.captures)
-        records = Records(options.results / f"{NAME}.json")
-        path = options.results / f"{NAME}.md"
-        for capture, variant in itertools.product(captures, options.variants):
-            key = key_of(capture=capture.resolve().name, variant=variant, overrides=options.overrides)
-            entry = None if options.again else records.find(key)
-            if entry is None:
-                sys.stderr.write(f"{capture.name}, {variant}: running\n")
-                entry = records.add(
-                    key, measure(capture, variant, options.work, options.kept, options.overrides)
-                )
-            else:
-                sys.stderr.write(f"{capture.name}, {variant}: kept from commit {entry['commit']}\n")
-            entries.append(entry)
-            write_text(path, page("What the refinement brings", NAME, words, render(entries)))
-    except MvdynError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    sys.stdout.write(render(entries))
-    sys.stderr.write(f"written: {path}\n")
-    return 0
+
+    def plan() -> list[Run]:
+        return [
+            Run(
+                label=f"{capture.name}, {variant}",
+                key=key_of(capture=capture.resolve().name, variant=variant, overrides=options.overrides),
+                measure=partial(measure, capture, variant, options.work, options.kept, options.overrides),
+                again=options.again,
+            )
+            for capture, variant in itertools.product(
+                captures_or_rendered(options.captures), options.variants
+            )
+        ]
+
+    pages = [Page(options.results / f"{NAME}.md", "What the refinement brings", render)]
+    return run_experiment(NAME, words, options.results / f"{NAME}.json", pages, plan)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,20 +27,20 @@ import numpy.typing as npt
 
 from experiments.records import (
     ExperimentError,
-    Records,
+    Page,
+    Run,
     add_common_arguments,
     captures_or_rendered,
     figure,
     finite,
     key_of,
-    page,
+    run_experiment,
     table,
-    write_text,
 )
 from experiments.start_errors import Frames, score_start, true_frames
 from mvdyn_gtsam.capture.model import Capture, FrameStream
 from mvdyn_gtsam.config import Config, load_config, to_dict
-from mvdyn_gtsam.errors import BaselineError, MvdynError
+from mvdyn_gtsam.errors import BaselineError
 
 if TYPE_CHECKING:
     from mvdyn_gtsam.frontend.start import Start
@@ -299,30 +300,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run, print the tables, write them."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     options = parser().parse_args(words)
-    try:
+
+    def plan() -> list[Run]:
         captures = captures_or_rendered(options.captures)
         wanted = variants(options.overrides, options.sweeps, options.joint_frames if options.joint_sfm else 0)
-        records = Records(options.results / f"{NAME}.json")
-        swept = "_".join(sweep.partition("=")[0].rsplit(".", 1)[-1] for sweep in options.sweeps)
-        path = options.results / f"{options.name or '_'.join(filter(None, [NAME, swept]))}.md"
-        entries: list[dict[str, Any]] = []
-        for folder, variant in itertools.product(captures, wanted):
-            key = variant.key(folder)
-            entry = None if options.again else records.find(key)
-            if entry is None:
-                sys.stderr.write(f"{folder.name}, {variant.name}: running\n")
-                entry = records.add(key, measure(folder, variant, options.kept))
-            else:
-                sys.stderr.write(f"{folder.name}, {variant.name}: kept from commit {entry['commit']}\n")
-            # A value of a sweep that equals the default was measured under that name.
-            entries.append({**entry, "variant": variant.name})
-            write_text(path, page("The wide-baseline start alone", NAME, words, render(entries)))
-    except MvdynError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    sys.stdout.write(render(entries))
-    sys.stderr.write(f"written: {path}\n")
-    return 0
+        return [
+            Run(
+                label=f"{folder.name}, {variant.name}",
+                key=variant.key(folder),
+                measure=partial(measure, folder, variant, options.kept),
+                again=options.again,
+                # A value of a sweep that equals the default was measured under that name.
+                shown_as={"variant": variant.name},
+            )
+            for folder, variant in itertools.product(captures, wanted)
+        ]
+
+    swept = "_".join(sweep.partition("=")[0].rsplit(".", 1)[-1] for sweep in options.sweeps)
+    path = options.results / f"{options.name or '_'.join(filter(None, [NAME, swept]))}.md"
+    pages = [Page(path, "The wide-baseline start alone", render)]
+    return run_experiment(NAME, words, options.results / f"{NAME}.json", pages, plan)
 
 
 if __name__ == "__main__":
