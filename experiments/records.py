@@ -166,7 +166,7 @@ class Page:
 def run_experiment(
     module: str, words: Sequence[str], records: Path, pages: Sequence[Page], plan: Callable[[], Sequence[Run]]
 ) -> int:
-    """Do the runs of ``plan`` that ``records`` lacks and write the pages after each; returns the exit code."""
+    """Do the runs of ``plan`` that ``records`` lacks, write the pages after each; returns the exit code."""
     entries: list[dict[str, Any]] = []
     try:
         kept = Records(records)
