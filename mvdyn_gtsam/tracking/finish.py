@@ -14,6 +14,7 @@ from factors.structureless import edge_residuals
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Edge, Frame
 from mvdyn_gtsam.tracking.connect import long_range_edges
+from mvdyn_gtsam.tracking.covariance import marginal_covariances
 from mvdyn_gtsam.tracking.model import (
     EdgeRecord,
     FrameDepth,
@@ -22,7 +23,7 @@ from mvdyn_gtsam.tracking.model import (
     measurement_of,
 )
 from mvdyn_gtsam.tracking.motion import PoseFit, predict_pose
-from mvdyn_gtsam.tracking.polish import estimate_noise, marginal_covariances, solve_all, total_cost
+from mvdyn_gtsam.tracking.polish import estimate_noise, solve_all, total_cost
 from mvdyn_gtsam.tracking.rig import hold_mounts
 from mvdyn_gtsam.tracking.state import TrackState
 from mvdyn_gtsam.tracking.window import solve_depth, useful_neighbours

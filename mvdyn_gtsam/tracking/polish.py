@@ -11,14 +11,12 @@ from types import MappingProxyType
 import gtsam
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve
 
-from factors.keys import M, S, X
+from factors.keys import S, X
 from factors.measurement import StructurelessMeasurement
 from factors.projection import reproject
 from mvdyn_gtsam.config import TrackingConfig
 from mvdyn_gtsam.frontend.rig import Pair, add_mounts
-from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.tracking.keyframe_factor import keyframe_factor
 from mvdyn_gtsam.tracking.model import Keyframe, View, measurement_of
 from mvdyn_gtsam.tracking.window import Priors, solve_depth, useful_neighbours
@@ -37,8 +35,6 @@ KEPT_BYTES = 128 * 2**20
 """Memory for measurements that are kept between linearisations; those beyond are built each time."""
 BYTES_PER_MEASUREMENT = 40
 """Of one point and edge in double precision: target, weight, information, and what they are made of."""
-LARGEST_INVERSE = 3000
-"""Unknowns up to which one dense inverse is faster than marginals from the Bayes tree; 72 MB."""
 METIS_FROM = 800
 """Variables from which nested dissection orders better than COLAMD."""
 
@@ -160,34 +156,6 @@ def _weighted_median(values: npt.NDArray[np.float64], weight: npt.NDArray[np.flo
     order = np.argsort(values, kind="stable")
     cumulative = np.cumsum(weight[order], dtype=np.float64)
     return float(values[order[np.searchsorted(cumulative, 0.5 * cumulative[-1])]])
-
-
-def marginal_covariances(
-    keyframes: list[Keyframe],
-    views: tuple[View, ...],
-    config: TrackingConfig,
-    priors: Priors,
-    mounts: Mounts = NO_MOUNTS,
-) -> dict[Frame, npt.NDArray[np.float64]]:
-    """``(6, 6)`` covariance of every keyframe's pose, tangent ``[omega, v]``."""
-    graph, values = build_graph(keyframes, views, config, priors, mounts=mounts)
-    if 7 * len(keyframes) > LARGEST_INVERSE:
-        marginals = gtsam.Marginals(graph, values)
-        return {keyframe.frame: marginals.marginalCovariance(X(*keyframe.frame)) for keyframe in keyframes}
-    ordering = gtsam.Ordering()
-    for keyframe in keyframes:
-        ordering.push_back(X(*keyframe.frame))
-        ordering.push_back(S(*keyframe.frame))
-    for pair in mounts:
-        ordering.push_back(M(*pair))
-    information, _ = graph.linearize(values).hessian(ordering)
-    # unit diagonal: the gauge is held a million times as firmly as the rest
-    scale = 1.0 / np.sqrt(np.diagonal(information))
-    covariance = scale[:, None] * cho_solve(cho_factor(information * scale[:, None] * scale), np.diag(scale))
-    return {
-        keyframe.frame: covariance[7 * row : 7 * row + 6, 7 * row : 7 * row + 6].copy()
-        for row, keyframe in enumerate(keyframes)
-    }
 
 
 def build_graph(

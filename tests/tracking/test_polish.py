@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 
+from factors.keys import X
 from mvdyn_gtsam.geometry import invert_pose, rotation_angle_deg
-from mvdyn_gtsam.tracking import polish
+from mvdyn_gtsam.tracking import covariance, polish
+from mvdyn_gtsam.tracking.covariance import marginal_covariances
 from mvdyn_gtsam.tracking.state import TrackState
 from tests.tracking.synthetic_scene import rig, two_cameras
 from tests.tracking.test_tracker import errors, track
 
 
-def test_the_dense_inverse_gives_the_marginals_of_the_bayes_tree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_inverses_give_the_marginals_of_the_bayes_tree(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker, _, _ = track(two_cameras(), ((0, 1),))
     state = tracker.state
     assert state.mounts == {}  # they move on their own
@@ -21,14 +24,20 @@ def test_the_dense_inverse_gives_the_marginals_of_the_bayes_tree(monkeypatch: py
 
 def _compare_covariances(state: TrackState, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = state.keyframes, state.views, state.tracking, state.priors, state.mounts
-    dense = polish.marginal_covariances(*arguments)
-    monkeypatch.setattr(polish, "LARGEST_INVERSE", 0)
-    tree = polish.marginal_covariances(*arguments)
-    assert dense.keys() == tree.keys() and len(dense) >= 6
-    for frame, covariance in dense.items():
-        spread = np.sqrt(np.diagonal(tree[frame]))
-        np.testing.assert_allclose(covariance, tree[frame], atol=1e-3 * np.outer(spread, spread).max())
-        np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)), spread, rtol=1e-3)
+    graph, values = polish.build_graph(
+        state.keyframes, state.views, state.tracking, state.priors, mounts=state.mounts
+    )
+    tree = gtsam.Marginals(graph, values)
+    dense = marginal_covariances(*arguments)
+    monkeypatch.setattr(covariance, "LARGEST_INVERSE", 0)
+    blocks = marginal_covariances(*arguments)
+    assert dense.keys() == blocks.keys() and len(dense) >= 6
+    for found in (dense, blocks):
+        for frame, block in found.items():
+            true = tree.marginalCovariance(X(*frame))
+            spread = np.sqrt(np.diagonal(true))
+            np.testing.assert_allclose(block, true, atol=1e-3 * np.outer(spread, spread).max())
+            np.testing.assert_allclose(np.sqrt(np.diagonal(block)), spread, rtol=1e-3)
 
 
 def test_cameras_mounted_on_one_another_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
