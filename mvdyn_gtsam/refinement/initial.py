@@ -35,7 +35,7 @@ def best_candidate(
     another is better by ``margin`` px of the summed cost.
     """
     shape = candidates[0].shape
-    judges = sorted(edges, key=lambda edge: -_parallax(edge, candidates[0]))[:SCORING_EDGES]
+    judges = most_telling(edges, candidates[0], SCORING_EDGES)
     triangulated = [_triangulated(edge, candidates[0]) for edge in judges[: SCORING_EDGES // 2]]
     best = candidates[0].copy()
     lowest = _score(best, judges, config, shape)
@@ -44,6 +44,11 @@ def best_candidate(
         better = score < lowest - margin
         best[better], lowest[better] = candidate[better], score[better]
     return best
+
+
+def most_telling(edges: Sequence[Edge], inverse_depth: Float32, count: int) -> list[Edge]:
+    """The ``count`` edges that see most parallax of depth ``(h, w)`` where they are trusted."""
+    return sorted(edges, key=lambda edge: -_parallax(edge, inverse_depth))[:count]
 
 
 def static_residual(inverse_depth: Float32, edges: Sequence[Edge]) -> Float32:

@@ -33,6 +33,9 @@ class RefinementConfig:
     """Times phase 2 solves poses, then depth, after a first depth. Source: choice, time."""
     affine_iterations: int = 5
     """Gauss-Newton iterations of phase 1. Source: choice."""
+    edges_per_frame: int = 8
+    """Edges of a frame that its depth is solved from, those with most parallax. Source: choice, time; more of
+    them added more bias than information on robodog_overlap."""
     depth_iterations: int = 5
     """Gauss-Newton iterations per depth solve, each with new confidences. Source: choice."""
     pose_iterations: int = 3
@@ -91,7 +94,7 @@ class RefinementConfig:
     def __post_init__(self) -> None:
         for name, low in (
             ("stride", 1), ("workers", 0), ("window", 1), ("overlap", 0), ("rounds", 1),
-            ("affine_iterations", 1), ("depth_iterations", 1), ("pose_iterations", 1),
+            ("affine_iterations", 1), ("edges_per_frame", 1), ("depth_iterations", 1), ("pose_iterations", 1),
         ):  # fmt: skip
             if getattr(self, name) < low:
                 raise ConfigError(f"refinement.{name} is {getattr(self, name)}; it must be at least {low}")

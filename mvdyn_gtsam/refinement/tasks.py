@@ -23,6 +23,7 @@ from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
     best_candidate,
     failing_regions,
+    most_telling,
     moving_regions,
     region_depth,
     static_residual,
@@ -175,6 +176,7 @@ def window_task(context: Context, window: tuple[str, str, int, int, int]) -> Non
             moves = workspace.read("moving", frame) != STATIC
             edges = context.edges(frame, wTc, own_camera=False)
             edges = [edge if edge.same_instant else edge.without(moves.ravel()) for edge in edges]
+            edges = most_telling(edges, context.image(source, frame), config.edges_per_frame)
             others = {
                 edge.j: renewed[edge.j] if edge.j in renewed else np.log(context.image(source, edge.j))
                 for edge in edges
