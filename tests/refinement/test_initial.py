@@ -16,6 +16,7 @@ from mvdyn_gtsam.refinement.initial import (
     _triangulated,
     best_candidate,
     failing_regions,
+    most_telling,
     moving_regions,
     region_depth,
     static_residual,
@@ -274,3 +275,15 @@ def test_temporal_edges_of_what_moves_lose_their_weight_by_themselves(
             assert moving < 0.3 * still
     # so the other camera alone says how far away the block is
     assert np.median(np.abs(solved - np.log(truth))[block]) < 0.01
+
+
+def test_edges_with_parallax_tell_most(scene: Scene, truth: Float32) -> None:
+    edges = [true_edge(scene, FRAME, (0, time), VIEW) for time in (1, 3, 4)]
+    far = true_edge(scene, FRAME, (1, 2), VIEW)
+    weak = replace(far, weight=np.full_like(far.weight, 1e-4))
+    baselines = [float(np.linalg.norm(edge.jTi[:3, 3])) for edge in (*edges, far)]
+    assert max(baselines) == baselines[-1]
+    assert most_telling([*edges, far], truth, 1) == [far]
+    # hardly trusted, it tells nothing however far apart the views are
+    assert weak not in most_telling([*edges, weak], truth, 3)
+    assert len(most_telling(edges, truth, 99)) == len(edges)
