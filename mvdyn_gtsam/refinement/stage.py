@@ -159,9 +159,9 @@ class Refinement:
         self.seconds[name] = perf_counter() - began
         self._workspace.finish(name)
 
-    def _map(self, task: str, jobs: Sequence[object]) -> None:
+    def _map(self, task: str, jobs: Sequence[object], label: str = "") -> None:
         for done, _ in enumerate(self._pool.map(task, jobs)):
-            self._progress.update(f"refine: {task}", done + 1, len(jobs))
+            self._progress.update(f"refine: {label or task}", done + 1, len(jobs))
 
     def _store_images(self) -> None:
         workspace, tracked = self._workspace, self._tracked
@@ -214,7 +214,7 @@ class Refinement:
 
         def solve() -> None:
             self._workspace.create(target)
-            self._map("window", jobs)
+            self._map("window", jobs, label=target)
 
         self._step(target, solve)
         self._depth = target
