@@ -17,7 +17,6 @@ from mvdyn_gtsam.errors import MvdynError
 
 PAGES = {
     "accuracy": "accuracy.md",
-    "time": "accuracy_against_best.md",
     "refinement": "refinement_phases.md",
     "start": "wide_baseline.md",
     "memory": "memory_growth.md",
