@@ -143,9 +143,10 @@ def _refine(
     for frame in refinement.frames():
         camera, time = frame.frame
         residuals.add(frame)
-        writer.write_refined(names[camera], time, frame.depth, frame.confidence, frame.moving)
+        writer.write_motion(names[camera], time, frame.moving)
+        writer.write_depth(names[camera], time, frame.depth, frame.confidence, refined=True)
     for camera, name in enumerate(names):
-        writer.write_refined_trajectory(name, capture.timestamps, refined.wTc[camera])
+        writer.write_trajectory(name, capture.timestamps, refined.wTc[camera], refined=True)
     writer.publish_refined()
     writer.set_diagnostics("residual_px", residuals.medians())
     writer.set_diagnostics("refinement_seconds", refined.seconds)

@@ -104,18 +104,18 @@ class ReconstructionWriter:
             log.warning("the manifest still says running: %s", problem)
 
     def write_trajectory(
-        self, camera: str, timestamps: npt.NDArray[np.float64], wTc: npt.NDArray[np.float64]
-    ) -> None:
-        """Write poses ``wTc`` ``(T, 4, 4)`` at ``timestamps`` ``(T,)`` s, one per frame; NaN = no pose."""
-        self._write_trajectory(self.folder, camera, timestamps, wTc)
-
-    def _write_trajectory(
         self,
-        folder: Path,
         camera: str,
         timestamps: npt.NDArray[np.float64],
         wTc: npt.NDArray[np.float64],
+        *,
+        refined: bool = False,
     ) -> None:
+        """Write poses ``wTc`` ``(T, 4, 4)`` at ``timestamps`` ``(T,)`` s, one per frame; NaN = no pose.
+
+        Those that are ``refined`` are seen by readers after ``publish_refined``.
+        """
+        folder = self._refined if refined else self.folder
         self._check_camera(camera)
         if wTc.shape != (self._frame_count, 4, 4) or timestamps.shape != (self._frame_count,):
             raise ValueError(
@@ -129,18 +129,14 @@ class ReconstructionWriter:
         time: int,
         depth: npt.NDArray[np.floating],
         confidence: npt.NDArray[np.floating],
+        *,
+        refined: bool = False,
     ) -> None:
-        """Write depth ``(H, W)`` (NaN = invalid) and confidence ``(H, W)`` in [0, 1] of frame ``time``."""
-        self._write_depth(self.folder, camera, time, depth, confidence)
+        """Write depth ``(H, W)`` (NaN = invalid) and confidence ``(H, W)`` in [0, 1] of frame ``time``.
 
-    def _write_depth(
-        self,
-        folder: Path,
-        camera: str,
-        time: int,
-        depth: npt.NDArray[np.floating],
-        confidence: npt.NDArray[np.floating],
-    ) -> None:
+        Those that are ``refined`` are seen by readers after ``publish_refined``.
+        """
+        folder = self._refined if refined else self.folder
         self._check_frame(camera, time)
         if depth.shape != self._sizes[camera] or confidence.shape != self._sizes[camera]:
             raise ValueError(
@@ -165,24 +161,10 @@ class ReconstructionWriter:
         """Where a refinement keeps its state until ``publish_refined``."""
         return refinement_folder(self.folder)
 
-    def write_refined(
-        self,
-        camera: str,
-        time: int,
-        depth: npt.NDArray[np.floating],
-        confidence: npt.NDArray[np.floating],
-        moving: npt.NDArray[np.uint8],
-    ) -> None:
-        """As ``write_depth``, with a motion mask ``(H, W)``; seen by readers after ``publish_refined``."""
+    def write_motion(self, camera: str, time: int, moving: npt.NDArray[np.uint8]) -> None:
+        """Write a motion mask ``(H, W)``; seen by readers after ``publish_refined``."""
         self._check_frame(camera, time)
         write_atomically(motion_path(self._refined, camera, time), encode_mask(moving))
-        self._write_depth(self._refined, camera, time, depth, confidence)
-
-    def write_refined_trajectory(
-        self, camera: str, timestamps: npt.NDArray[np.float64], wTc: npt.NDArray[np.float64]
-    ) -> None:
-        """As ``write_trajectory``; seen by readers after ``publish_refined``."""
-        self._write_trajectory(self._refined, camera, timestamps, wTc)
 
     def publish_refined(self) -> None:
         """Let the refined frames and poses take the place of tracking's, which move to ``tracking/``.

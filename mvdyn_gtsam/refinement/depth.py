@@ -49,6 +49,19 @@ class DepthPrior:
 
 
 @dataclass(frozen=True)
+class FrameProblem:
+    """What decides the depth of one frame."""
+
+    edges: Sequence[Edge]
+    others: Mapping[Frame, Float32]
+    """``theta (h, w)`` of the frames that the edges lead to, as far as L_disp shall use them."""
+    image_weights: tuple[Float32, Float32]
+    """Of ``smoothness_weights``."""
+    prior: DepthPrior
+    config: RefinementConfig
+
+
+@dataclass(frozen=True)
 class Normal:
     """Gauss-Newton system of one frame."""
 
@@ -62,23 +75,15 @@ class Normal:
 
 def solve_frame(
     theta: Float32,
-    edges: Sequence[Edge],
-    others: Mapping[Frame, Float32],
-    image_weights: tuple[Float32, Float32],
-    prior: DepthPrior,
-    config: RefinementConfig,
+    problem: FrameProblem,
     iterations: int,
 ) -> tuple[Float32, Float32]:
-    """``theta (h, w)`` after Gauss-Newton steps, and the information ``(h, w)`` that the flow has on it.
-
-    ``others`` holds ``theta`` of the frames that the edges lead to, as far as L_disp shall use them;
-    ``image_weights`` are those of ``smoothness_weights``.
-    """
+    """``theta (h, w)`` after Gauss-Newton steps, and the information ``(h, w)`` that the flow has on it."""
     information = np.zeros_like(theta)
     for iteration in range(iterations):
         # depth edges are found coarse to fine: a wide kernel first
         widening = min(WIDEST_KERNEL, 2.0 ** max(0, iterations - 2 - iteration))
-        normal = normal_equations(theta, edges, others, image_weights, prior, config, widening)
+        normal = normal_equations(theta, problem, widening)
         preconditioner = sparse.dia_array((1.0 / normal.matrix.diagonal()[None], [0]), normal.matrix.shape)
         step, _ = cg(
             normal.matrix, -normal.gradient, rtol=SOLVER_TOLERANCE, maxiter=SOLVER_STEPS, M=preconditioner
@@ -90,14 +95,12 @@ def solve_frame(
 
 def normal_equations(
     theta: Float32,
-    edges: Sequence[Edge],
-    others: Mapping[Frame, Float32],
-    image_weights: tuple[Float32, Float32],
-    prior: DepthPrior,
-    config: RefinementConfig,
+    problem: FrameProblem,
     widening: float = 1.0,
 ) -> Normal:
-    """The reweighted cost at ``theta (h, w)`` to second order; arguments as for ``solve_frame``."""
+    """The reweighted cost at ``theta (h, w)`` to second order; ``widening`` is of the smoothness kernel."""
+    edges, others, image_weights = problem.edges, problem.others, problem.image_weights
+    prior, config = problem.prior, problem.config
     information, agreement, gradient = (np.zeros(theta.size, np.float32) for _ in range(3))
     inverse_depth = np.exp(theta).ravel()
     for edge in edges:
@@ -123,13 +126,11 @@ def normal_equations(
 
 def cost(
     theta: Float32,
-    edges: Sequence[Edge],
-    others: Mapping[Frame, Float32],
-    image_weights: tuple[Float32, Float32],
-    prior: DepthPrior,
-    config: RefinementConfig,
+    problem: FrameProblem,
 ) -> float:
     """The cost whose reweighted form ``normal_equations`` linearises: floors and confidences as there."""
+    edges, others, image_weights = problem.edges, problem.others, problem.image_weights
+    prior, config = problem.prior, problem.config
     inverse_depth = np.exp(theta).ravel()
     total = 0.0
     for edge in edges:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,8 +45,10 @@ class SampleStore:
         """Replace what the file holds. Raises ResultError when the disk is full."""
         with self._path.open("wb") as file:
             for sample in samples:
+                frames = np.array([sample.i, *sample.neighbours])
                 try:
-                    pickle.dump(sample, file, protocol=pickle.HIGHEST_PROTOCOL)
+                    for array in (frames, *(getattr(sample, name) for name in _ARRAYS)):
+                        np.save(file, array, allow_pickle=False)
                     file.flush()
                 except OSError as error:
                     raise ResultError(
@@ -59,4 +60,9 @@ class SampleStore:
         """The samples in the order written, one in memory at a time."""
         with self._path.open("rb") as file:
             while file.peek(1):
-                yield pickle.load(file)  # noqa: S301 - written by this very run
+                i, *neighbours = [(int(camera), int(time)) for camera, time in np.load(file)]
+                arrays = {name: np.load(file) for name in _ARRAYS}
+                yield FrameSample(i=i, neighbours=tuple(neighbours), **arrays)
+
+
+_ARRAYS = ("rays", "inverse_depth", "intrinsics", "target", "weight", "inverse_depth_there")

@@ -36,8 +36,9 @@ BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
 BYTES_PER_PIXEL = 50.0
 """Of a view on disk besides its flow: twelve arrays of 32 bits and two of 8."""
-SECONDS_PER_MEGAPIXEL = 0.25
-"""One flow pair on one processor, per million pixels of the input; measured, DIS at half resolution."""
+SECONDS_PER_MEGAPIXEL = 0.37
+"""One flow pair on one processor, per million pixels of the input. Source: robodog_overlap and HoloLens in
+experiments/results/refinement_phases.json."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,7 @@ class Refinement:
 
     def _sample(self) -> Callable[[], Iterable[FrameSample]]:
         """Sample every frame once; what is returned reads them back, as often as a solve asks."""
-        store = SampleStore(self._workspace.folder / "samples.pickle")
+        store = SampleStore(self._workspace.folder / "samples.npy")
         jobs = [(self._depth, frame) for frame in self._frames]
         store.write(sample for sample in self._pool.map("sample", jobs) if isinstance(sample, FrameSample))
         return store.read

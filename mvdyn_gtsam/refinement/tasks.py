@@ -17,7 +17,7 @@ from mvdyn_gtsam.frontend.dense_depth import filled
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import Pair
-from mvdyn_gtsam.refinement.depth import DepthPrior, smoothness_weights, solve_frame
+from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
 from mvdyn_gtsam.refinement.edges import Edge, load_edges
 from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
@@ -118,7 +118,9 @@ def begin_task(context: Context, frame: Frame) -> None:
     weights = _image_weights(context, frame)
     chosen = best_candidate([context.image("aligned", frame), context.image("swept", frame)], edges, config)
     weak = DepthPrior(np.log(chosen), np.full(chosen.shape, config.prior_sigma**-2, np.float32))
-    theta, information = solve_frame(np.log(chosen), edges, {}, weights, weak, config, FIRST_STEPS)
+    theta, information = solve_frame(
+        np.log(chosen), FrameProblem(edges, {}, weights, weak, config), FIRST_STEPS
+    )
     workspace.write("first", frame, theta)
     workspace.write("information", frame, information)
     workspace.write("fails", frame, failing_regions(static_residual(np.exp(theta), edges), config))
@@ -183,7 +185,9 @@ def window_task(context: Context, window: tuple[str, str, int, int, int]) -> Non
             }
             prior = DepthPrior(context.image("prior", frame), context.image("prior_weight", frame))
             theta, weights = np.log(context.image(source, frame)), _image_weights(context, frame)
-            theta, information = solve_frame(theta, edges, others, weights, prior, config, steps)
+            theta, information = solve_frame(
+                theta, FrameProblem(edges, others, weights, prior, config), steps
+            )
             renewed[frame] = theta
             if first <= frame[1] < end:
                 workspace.write(target, frame, np.exp(theta))

@@ -21,6 +21,7 @@ from mvdyn_gtsam.refinement.depth import (
     FLOW_FLOOR_PX,
     RATIO_FLOOR,
     DepthPrior,
+    FrameProblem,
     cost,
     normal_equations,
     robust_cost,
@@ -56,8 +57,9 @@ class Problem:
     image_weights: Any
     prior: DepthPrior
 
-    def arguments(self) -> tuple[list[Edge], dict[Frame, Any], Any, DepthPrior]:
-        return self.edges, self.others, self.image_weights, self.prior
+    def with_config(self, config: RefinementConfig) -> FrameProblem:
+        """As the code under test takes it."""
+        return FrameProblem(self.edges, self.others, self.image_weights, self.prior, config)
 
 
 def problem(seed: int = 0) -> Problem:
@@ -106,14 +108,14 @@ def test_the_gradient_is_that_of_the_cost(seed: int, only: str) -> None:
     if only not in ("prior", "all"):
         nothing = DepthPrior(given_.prior.theta, np.zeros_like(given_.prior.weight))
         given_ = replace(given_, prior=nothing)
-    gradient = normal_equations(given_.theta, *given_.arguments(), config).gradient
+    gradient = normal_equations(given_.theta, given_.with_config(config)).gradient
     numeric = np.empty(given_.theta.size)
     step = 1e-6
     for pixel in range(given_.theta.size):
         moved = np.zeros(given_.theta.size)
         moved[pixel] = step
         up, down = (given_.theta + sign * moved.reshape(given_.theta.shape) for sign in (1, -1))
-        above, below = (cost(theta, *given_.arguments(), config) for theta in (up, down))
+        above, below = (cost(theta, given_.with_config(config)) for theta in (up, down))
         numeric[pixel] = (above - below) / (2.0 * step)
     assert np.abs(numeric).max() > 1.0
     np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-4 * np.abs(numeric).max())
@@ -188,7 +190,7 @@ def test_the_five_diagonals_are_the_explicit_system(seed: int) -> None:
     given_ = problem(seed)
     # beyond so wide a kernel the links are of all strengths
     config = replace(CONFIG, smoothness_scale=0.05)
-    matrix = normal_equations(given_.theta, *given_.arguments(), config).matrix.toarray()
+    matrix = normal_equations(given_.theta, given_.with_config(config)).matrix.toarray()
     np.testing.assert_allclose(matrix, explicit_matrix(given_, config), rtol=2e-3, atol=1e-2)
     np.testing.assert_array_equal(matrix, matrix.T)
     assert np.linalg.eigvalsh(matrix.astype(np.float64)).min() > 0.0
@@ -206,10 +208,10 @@ def test_information_is_that_of_the_flow_alone() -> None:
     corner[:3] = True
     edges = [edge.without(corner) for edge in given_.edges]
     given_ = replace(given_, edges=edges)
-    whole = normal_equations(given_.theta, *given_.arguments(), CONFIG)
+    whole = normal_equations(given_.theta, given_.with_config(CONFIG))
     nothing = DepthPrior(given_.prior.theta, np.zeros_like(given_.prior.weight))
     alone = replace(given_, others={}, prior=nothing)
-    flow = normal_equations(given_.theta, *alone.arguments(), replace(CONFIG, smoothness=0.0))
+    flow = normal_equations(given_.theta, alone.with_config(replace(CONFIG, smoothness=0.0)))
     np.testing.assert_allclose(flow.matrix.diagonal(), flow.information)
     np.testing.assert_allclose(whole.information, flow.information)
     assert (flow.information[:3] == 0.0).all() and (flow.information[3:] > 0.0).any()
@@ -249,7 +251,7 @@ def test_the_solution_is_that_of_a_general_optimiser(seed: int, monkeypatch: pyt
         CONFIG, flow_lambda=1e6, disparity_lambda=1e6, smoothness_scale=100.0, smoothness=2e4, flow_weight=9.0
     )
     given_ = problem(seed)
-    found, _ = solve_frame(given_.theta, *given_.arguments(), config, 25)
+    found, _ = solve_frame(given_.theta, given_.with_config(config), 25)
     residuals = stacked(given_, config, floors)
     expected = least_squares(residuals, given_.theta.ravel(), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     assert np.abs(expected.x - given_.theta.ravel()).max() > 0.05
@@ -264,10 +266,10 @@ def test_a_general_descent_ends_at_no_lower_robust_cost(seed: int) -> None:
 
     def objective(flat: Array) -> tuple[float, Array]:
         theta = flat.reshape(given_.theta.shape)
-        gradient = normal_equations(theta, *given_.arguments(), config).gradient
-        return cost(theta, *given_.arguments(), config), gradient.astype(np.float64)
+        gradient = normal_equations(theta, given_.with_config(config)).gradient
+        return cost(theta, given_.with_config(config)), gradient.astype(np.float64)
 
-    found, _ = solve_frame(given_.theta, *given_.arguments(), config, 20)
+    found, _ = solve_frame(given_.theta, given_.with_config(config), 20)
     before, after = objective(given_.theta.ravel())[0], objective(found.ravel().astype(np.float64))[0]
     descent = minimize(objective, given_.theta.ravel(), jac=True, method="L-BFGS-B")
     assert descent.fun < before
@@ -305,7 +307,9 @@ def test_depth_is_recovered_from_a_wrong_start(scene: Scene, share: float, itera
     truth, edges = true_theta(scene, FRAME, view), true_edges(scene, FRAME, view)
     start = off_the_truth(truth)
     solved, information = solve_frame(
-        start, with_wrong_flow(edges, share), {}, outlined(truth), weak_prior(start), GENTLE, iterations
+        start,
+        FrameProblem(with_wrong_flow(edges, share), {}, outlined(truth), weak_prior(start), GENTLE),
+        iterations,
     )
     assert np.median(np.abs(start - truth)) > 0.1
     error = np.abs(solved - truth)
@@ -323,7 +327,10 @@ def test_more_iterations_do_not_join_depths_that_the_flow_tells_apart(scene: Sce
     truth, edges = true_theta(scene, FRAME, view), true_edges(scene, FRAME, view)
     plain = smoothness_weights(np.zeros(truth.shape), CONFIG.edge_contrast)
     errors = [
-        np.abs(solve_frame(truth, edges, {}, plain, weak_prior(truth), CONFIG, iterations)[0] - truth)
+        np.abs(
+            solve_frame(truth, FrameProblem(edges, {}, plain, weak_prior(truth), CONFIG), iterations)[0]
+            - truth
+        )
         for iterations in (5, 20)
     ]
     joined = [(error > 0.4).mean() for error in errors]
@@ -339,11 +346,15 @@ def test_a_hole_without_flow_is_filled_from_its_surroundings(scene: Scene) -> No
     edges = [edge.without(hole.ravel()) for edge in true_edges(scene, FRAME, view)]
     start = off_the_truth(truth)
     start[hole] = truth[hole] + 0.3
-    solved, information = solve_frame(start, edges, {}, outlined(truth), weak_prior(start), CONFIG, 10)
+    solved, information = solve_frame(
+        start, FrameProblem(edges, {}, outlined(truth), weak_prior(start), CONFIG), 10
+    )
     assert np.abs(solved - truth)[hole].max() < 0.03
     assert (information[hole] == 0.0).all()
     unsmoothed, _ = solve_frame(
-        start, edges, {}, outlined(truth), weak_prior(start), replace(CONFIG, smoothness=0.0), 10
+        start,
+        FrameProblem(edges, {}, outlined(truth), weak_prior(start), replace(CONFIG, smoothness=0.0)),
+        10,
     )
     np.testing.assert_allclose(unsmoothed[hole], start[hole], atol=1e-3)
 
@@ -369,7 +380,9 @@ def test_disparity_pulls_neighbours_together(scene: Scene) -> None:
         for _ in range(2):
             for frame, edge in ((i, forth), (j, back)):
                 image, prior = outlined(start[frame]), weak_prior(start[frame])
-                theta[frame], _ = solve_frame(theta[frame], [edge], theta, image, prior, used, 4)
+                theta[frame], _ = solve_frame(
+                    theta[frame], FrameProblem([edge], theta, image, prior, used), 4
+                )
         return theta
 
     assert disagreement(start) == pytest.approx(0.1, abs=0.03)
@@ -392,7 +405,7 @@ def test_smoothness_does_not_cross_an_edge_of_the_image(edge_at: int | None) -> 
     prior.theta[:, 10:], prior.weight[:, 10:] = 0.3, 1e-2
     config = replace(CONFIG, smoothness_scale=1.0, smoothness=5.0)
     weights = smoothness_weights(grey, config.edge_contrast)
-    solved, _ = solve_frame(prior.theta, [], {}, weights, prior, config, 10)
+    solved, _ = solve_frame(prior.theta, FrameProblem([], {}, weights, prior, config), 10)
     np.testing.assert_allclose(solved[:, :10], 0.0, atol=0.02)
     if edge_at is None:
         assert solved[:, 10:].max() < 0.05

@@ -9,7 +9,7 @@ import pytest
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
-from mvdyn_gtsam.refinement.depth import DepthPrior, smoothness_weights, solve_frame
+from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
 from mvdyn_gtsam.refinement.edges import Edge
 from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
@@ -261,7 +261,7 @@ def test_temporal_edges_of_what_moves_lose_their_weight_by_themselves(
     prior = DepthPrior(start, np.full(start.shape, 1.0, np.float32))
     image = smoothness_weights(60.0 * np.log(truth), CONFIG.edge_contrast)
     config = replace(CONFIG, smoothness=0.2)
-    solved, _ = solve_frame(start, seen, {}, image, prior, config, 10)
+    solved, _ = solve_frame(start, FrameProblem(seen, {}, image, prior, config), 10)
     rho = np.exp(solved).ravel()
     inside = block.ravel()
     for edge in seen:
