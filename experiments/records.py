@@ -11,17 +11,24 @@ import platform
 import shlex
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mvdyn_gtsam.errors import MvdynError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "experiments" / "results"
 RENDERED = ROOT.parent / "shared" / "data" / "rendered"
 """Captures next to the checkout; too large to keep in it."""
+QUICK = ROOT / "out" / "quick"
+"""Results of ``--quick``, apart from the kept ones."""
+QUICK_CAMERAS, QUICK_FRAMES = 2, 14
 
 
 class ExperimentError(MvdynError):
@@ -161,6 +168,43 @@ class Page:
     path: Path
     title: str
     render: Callable[[Sequence[Mapping[str, Any]]], str]
+    plot: Callable[[Figure, Sequence[Mapping[str, Any]]], None] | None = None
+    """Draws the entries into an empty figure, which is kept as PNG next to the page."""
+
+    def write(self, module: str, words: Sequence[str], entries: Sequence[Mapping[str, Any]]) -> str | None:
+        """Write page and plot; what the plot lacks, or None. Raises ExperimentError, as does ``render``."""
+        body, problem = self.render(entries), None
+        if self.plot is not None:
+            picture = self.path.with_suffix(".png")
+            problem = _draw(picture, self.plot, entries)
+            if problem is None:
+                body += f"\n![{self.title}]({picture.name})\n"
+        write_text(self.path, page(self.title, module, words, body))
+        return problem
+
+
+def _draw(
+    path: Path,
+    plot: Callable[[Figure, Sequence[Mapping[str, Any]]], None],
+    entries: Sequence[Mapping[str, Any]],
+) -> str | None:
+    try:
+        # The figure without pyplot: no window system, no global state.
+        from matplotlib.figure import Figure
+    except ImportError:
+        return f"{path}: not drawn, plots need matplotlib: pip install mvdyn_gtsam[view]"
+    figure = Figure(figsize=(9.0, 4.5), layout="constrained")
+    plot(figure, entries)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(partial, dpi=100, format="png")
+        partial.replace(path)
+    except OSError as error:
+        raise ExperimentError(
+            f"{path}: cannot be written ({error.strerror}); choose another --results"
+        ) from error
+    return None
 
 
 def run_experiment(
@@ -168,6 +212,7 @@ def run_experiment(
 ) -> int:
     """Do the runs of ``plan`` that ``records`` lacks, write the pages after each; returns the exit code."""
     entries: list[dict[str, Any]] = []
+    problems: dict[str, None] = {}
     try:
         kept = Records(records)
         for run in plan():
@@ -178,12 +223,12 @@ def run_experiment(
             else:
                 sys.stderr.write(f"{run.label}: kept from commit {entry['commit']}\n")
             entries.append({**entry, **run.shown_as})
-            for item in pages:
-                write_text(item.path, page(item.title, module, words, item.render(entries)))
+            problems.update({p: None for item in pages if (p := item.write(module, words, entries))})
     except MvdynError as error:
         sys.stderr.write(f"{error}\n")
         return 1
     sys.stdout.write("\n".join(item.render(entries) for item in pages))
+    sys.stderr.write("".join(f"{problem}\n" for problem in problems))
     sys.stderr.write(f"written: {', '.join(str(item.path) for item in pages)}\n")
     return 0
 
@@ -203,8 +248,83 @@ def captures_or_rendered(folders: Sequence[Path]) -> list[Path]:
 
 
 def add_common_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--results`` and ``--again``, which every long experiment has."""
+    """``--results`` and ``--again``, for a parser that is not made by :func:`experiment_parser`."""
     parser.add_argument(
         "--results", type=Path, default=RESULTS, metavar="DIR", help="where JSON and Markdown go"
     )
+    _add_again(parser)
+
+
+def _add_again(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--again", action="store_true", help="run anew what the results already hold")
+
+
+def experiment_parser(
+    name: str, description: str | None, captures: bool = True, again: bool = True
+) -> argparse.ArgumentParser:
+    """Command line with ``captures``, ``--quick``, ``--results``, ``--work``, ``--again`` and ``--set``.
+
+    ``captures`` and ``again``: False leaves these out, for an experiment that has its own. To be read by
+    :func:`parse`.
+    """
+    result = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    if captures:
+        result.add_argument("captures", nargs="*", type=Path, help="default: all of ../shared/data/rendered")
+    result.add_argument("--quick", action="store_true",
+                        help="a tiny generated scene, results in out/quick")  # fmt: skip
+    result.add_argument("--results", type=Path, metavar="DIR",
+                        help="where JSON, Markdown and plots go (default: experiments/results)")  # fmt: skip
+    result.add_argument("--work", type=Path, metavar="DIR",
+                        help=f"where reconstructions and logs go (default: out/{name})")  # fmt: skip
+    result.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
+                        help="change a setting of ours, e.g. tracking.robust_px=0.5")  # fmt: skip
+    if again:
+        _add_again(result)
+    result.set_defaults(experiment=name)
+    return result
+
+
+def parse(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Namespace:
+    """Arguments of :func:`experiment_parser` with ``results`` and ``work`` filled in.
+
+    Exits with one line where ``--quick`` is given captures, or would write among the kept results.
+    """
+    options = parser.parse_args(words)
+    if options.quick and getattr(options, "captures", None):
+        parser.error("--quick makes its own scene; name captures or give --quick, not both")
+    if options.results is None:
+        options.results = QUICK if options.quick else RESULTS
+    elif options.quick and options.results.resolve() == RESULTS.resolve():
+        parser.error(f"--quick would write among the kept results; choose another folder than {RESULTS}")
+    if options.work is None:
+        folder = options.results / "work" if options.quick else ROOT / "out"
+        options.work = folder / options.experiment
+    return options
+
+
+def captures_of(options: argparse.Namespace) -> list[Path]:
+    """The captures that :func:`parse` read: those named, the rendered ones, or the scene of ``--quick``.
+
+    Raises ExperimentError for a folder that is not there: hours later would be too late.
+    """
+    return [quick_scene(options.results)] if options.quick else captures_or_rendered(options.captures)
+
+
+def quick_scene(results: Path, cameras: int = QUICK_CAMERAS, frames: int = QUICK_FRAMES) -> Path:
+    """The scene of ``--quick`` below ``results``, generated where it is not there yet."""
+    folder = results / "scenes" / f"quick_{cameras}x{frames}"
+    if not (folder / "capture.json").is_file():
+        from experiments.quick import quick_capture
+
+        # Made elsewhere and moved: a scene that was interrupted is not taken for a whole one.
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="partial-", dir=folder.parent) as partial:
+            quick_capture(Path(partial) / folder.name, cameras, frames).rename(folder)
+    return folder
+
+
+def settings_arguments(overrides: Sequence[str]) -> list[str]:
+    """``--set KEY=VALUE`` for each, for the command line of `mvdyn reconstruct`."""
+    return [word for override in overrides for word in ("--set", override)]

@@ -2,11 +2,34 @@
 
 from __future__ import annotations
 
+import sys
+import types
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from experiments.records import ExperimentError, Records, figure, key_of, page, table
+from experiments.records import (
+    QUICK,
+    RESULTS,
+    ROOT,
+    ExperimentError,
+    Page,
+    Records,
+    Run,
+    captures_of,
+    experiment_parser,
+    figure,
+    key_of,
+    page,
+    parse,
+    run_experiment,
+    table,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def test_an_entry_is_found_again_and_replaced(tmp_path: Path) -> None:
@@ -60,3 +83,85 @@ def test_figure(value: float | None, cell: str) -> None:
 def test_page_holds_a_command_that_can_be_pasted() -> None:
     text = page("T", "accuracy", ["a folder", "--set", "x=[1, 2]"], "body\n")
     assert "    python -m experiments.accuracy 'a folder' --set 'x=[1, 2]'\n" in text
+
+
+def small_run(words: list[str], results: Path, measure: Callable[[], dict[str, Any]]) -> int:
+    """An experiment of one run, its page with a plot."""
+
+    def plot(figure: Figure, entries: Sequence[Mapping[str, Any]]) -> None:
+        figure.subplots().plot([entry["value"] for entry in entries], "o")
+
+    pages = [Page(results / "small.md", "Small", lambda entries: f"{len(entries)} run\n", plot)]
+    return run_experiment(
+        "small",
+        words,
+        results / "small.json",
+        pages,
+        lambda: [Run("one", "one", measure, "--again" in words)],
+    )
+
+
+def test_a_page_shows_its_plot(tmp_path: Path) -> None:
+    assert small_run([], tmp_path, lambda: {"value": 1}) == 0
+    assert "![Small](small.png)" in (tmp_path / "small.md").read_text()
+    assert (tmp_path / "small.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["small.json", "small.md", "small.png"]
+
+
+def test_without_matplotlib_the_page_is_written_and_one_line_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert small_run([], tmp_path, lambda: {"value": 1}) == 0
+    assert "small.png" not in (tmp_path / "small.md").read_text() and not (tmp_path / "small.png").exists()
+    lines = [line for line in capsys.readouterr().err.splitlines() if "pip install" in line]
+    assert len(lines) == 1 and lines[0].endswith("pip install mvdyn_gtsam[view]")
+
+
+def test_a_plot_that_cannot_be_written_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "small.png").mkdir()
+    assert small_run([], tmp_path, lambda: {"value": 1}) == 1
+    assert "--results" in capsys.readouterr().err.splitlines()[-1]
+    assert Records(tmp_path / "small.json").find("one") is not None
+
+
+def test_results_and_work_follow_quick(tmp_path: Path) -> None:
+    parser = experiment_parser("name", "What it does.")
+    full, quick = parse(parser, []), parse(parser, ["--quick"])
+    assert (full.results, full.work) == (RESULTS, ROOT / "out" / "name")
+    assert (quick.results, quick.work) == (QUICK, QUICK / "work" / "name")
+    own = parse(parser, ["--quick", "--results", str(tmp_path), "--set", "a=1", "--set", "b=2"])
+    assert own.work == tmp_path / "work" / "name" and own.overrides == ["a=1", "b=2"]
+
+
+@pytest.mark.parametrize("words", [["--quick", "somewhere"], ["--quick", "--results", str(RESULTS)]])
+def test_quick_never_touches_the_kept_results(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        parse(experiment_parser("name", "What it does."), words)
+    assert stopped.value.code == 2 and "--quick" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_the_scene_of_quick_is_made_once_and_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Path] = []
+
+    def fake(folder: Path, cameras: int = 2, frames: int = 14) -> Path:
+        made.append(folder)
+        folder.mkdir(parents=True)
+        if len(made) == 1:
+            raise KeyboardInterrupt
+        (folder / "capture.json").write_text(f"{cameras} {frames}")
+        return folder
+
+    module = types.ModuleType("experiments.quick")
+    module.quick_capture = fake  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "experiments.quick", module)
+    options = parse(experiment_parser("name", None), ["--quick", "--results", str(tmp_path)])
+    with pytest.raises(KeyboardInterrupt):
+        captures_of(options)
+    assert list((tmp_path / "scenes").iterdir()) == []
+    for _ in range(2):
+        assert captures_of(options) == [tmp_path / "scenes" / "quick_2x14"]
+    assert len(made) == 2 and (tmp_path / "scenes" / "quick_2x14" / "capture.json").read_text() == "2 14"
+    assert [path.name for path in (tmp_path / "scenes").iterdir()] == ["quick_2x14"]
