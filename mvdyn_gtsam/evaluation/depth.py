@@ -53,10 +53,16 @@ class DepthScores:
     delta_1_25: float | None
     abs_rel_static: float | None
     abs_rel_moving: float | None
+    delta_1_25_static: float | None
+    delta_1_25_moving: float | None
     m_d: float | None
-    """Median distance in metres of corresponding points in the world, after the trajectory's full Sim(3)."""
+    """Strict: median distance in metres of corresponding points in the world after the trajectory's full
+    Sim(3), so that errors of pose and of depth both count."""
+    m_d_static: float | None
+    m_d_moving: float | None
     m_d_scale_only: float | None
-    """The same in each camera's own frame: the depth takes the Sim(3)'s scale, its pose plays no part."""
+    """The paper's supplement read to the letter, ``D = s D_est``: the same in each camera's own frame, where
+    the depth takes the Sim(3)'s scale and the pose plays no part."""
     frames: int
     """Frames with a true depth image."""
     frames_without_estimate: int
@@ -72,6 +78,8 @@ class _Accumulator:
     moving: _PixelSums = field(default_factory=_PixelSums)
     world_distances: list[npt.NDArray[np.float32]] = field(default_factory=list)
     camera_distances: list[npt.NDArray[np.float32]] = field(default_factory=list)
+    static_distances: list[npt.NDArray[np.float32]] = field(default_factory=list)
+    moving_distances: list[npt.NDArray[np.float32]] = field(default_factory=list)
     frames: int = 0
     frames_without_estimate: int = 0
     true_pixels: int = 0
@@ -83,7 +91,11 @@ class _Accumulator:
             delta_1_25=self.all.delta_1_25,
             abs_rel_static=self.static.abs_rel,
             abs_rel_moving=self.moving.abs_rel,
+            delta_1_25_static=self.static.delta_1_25,
+            delta_1_25_moving=self.moving.delta_1_25,
             m_d=_median(self.world_distances),
+            m_d_static=_median(self.static_distances),
+            m_d_moving=_median(self.moving_distances),
             m_d_scale_only=_median(self.camera_distances),
             frames=self.frames,
             frames_without_estimate=self.frames_without_estimate,
@@ -203,7 +215,8 @@ def _add_frame(
         return
     total.estimated_pixels += int(valid.sum())
     g, e = truth[valid].astype(np.float64), estimated[valid].astype(np.float64)
-    _add_relative_errors(total, g, e, groundtruth.moving(match.camera, time), valid)
+    moves = _moving_pixels(groundtruth, match.camera, time, valid)
+    _add_relative_errors(total, g, e, moves)
     if row >= 0 and match.has_estimate[row]:
         intrinsics = reconstruction.intrinsics(match.camera)
         step = max(1, -(-len(g) // budget))
@@ -213,14 +226,27 @@ def _add_frame(
         )
         total.world_distances.append(world)
         total.camera_distances.append(camera)
+        if moves is not None:
+            total.moving_distances.append(world[moves[::step]])
+            total.static_distances.append(world[~moves[::step]])
+
+
+def _moving_pixels(
+    groundtruth: GroundTruth, camera: str, time: int, valid: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.bool_] | None:
+    """``(N,)`` of the N valid pixels, those that move; None without a mask of that frame."""
+    moving = groundtruth.moving(camera, time)
+    if moving is None:
+        return None
+    if moving.shape != valid.shape:
+        raise EvaluationError(
+            f"{camera} frame {time}: motion mask is {moving.shape[::-1]}, depth {valid.shape[::-1]} pixels"
+        )
+    return moving[valid]
 
 
 def _add_relative_errors(
-    total: _Accumulator,
-    g: Array,
-    e: Array,
-    moving: npt.NDArray[np.bool_] | None,
-    valid: npt.NDArray[np.bool_],
+    total: _Accumulator, g: Array, e: Array, moves: npt.NDArray[np.bool_] | None
 ) -> None:
     scale, offset = fit_scale_and_offset(e, g)
     aligned = scale * e + offset
@@ -229,11 +255,8 @@ def _add_relative_errors(
         # A depth at or behind the camera is no depth: it fails the ratio test.
         within = (aligned > 0) & (np.maximum(aligned / g, g / np.where(aligned > 0, aligned, np.nan)) < 1.25)
     total.all.add(relative, within)
-    if moving is None:
+    if moves is None:
         return
-    if moving.shape != valid.shape:
-        raise EvaluationError(f"motion mask is {moving.shape[::-1]}, depth {valid.shape[::-1]} pixels")
-    moves = moving[valid]
     total.moving.add(relative[moves], within[moves])
     total.static.add(relative[~moves], within[~moves])
 
@@ -263,6 +286,8 @@ def _merged(parts: Iterable[_Accumulator]) -> _Accumulator:
             sums.within += other.within
         total.world_distances += part.world_distances
         total.camera_distances += part.camera_distances
+        total.static_distances += part.static_distances
+        total.moving_distances += part.moving_distances
         total.frames += part.frames
         total.frames_without_estimate += part.frames_without_estimate
         total.true_pixels += part.true_pixels

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,15 @@ from mvdyn_gtsam.evaluation.depth import frame_depth_error
 from mvdyn_gtsam.evaluation.groundtruth import GroundTruth
 from mvdyn_gtsam.evaluation.trajectory import TrajectoryErrors, trajectory_errors
 
+DEPTH_FRAMES = 3
+"""Frames of one camera in a plot of depth errors."""
+WORST_SHOWN = 0.25
+"""Relative depth error at the end of the colours: where the ratio test of delta < 1.25 fails."""
+
 
 def save_plots(reconstruction: ReconstructionLike, groundtruth: GroundTruth, folder: Path) -> list[Path]:
     """Write ``trajectories.png`` (X-Y and X-Z, metres), ``error.png`` (position error over time) and, of each
-    camera with estimated and true depth, ``depth_<camera>.png`` (error map of their middle frame).
+    camera with estimated and true depth, ``depth_<camera>.png`` (error maps of some frames spread over time).
 
     Raises EvaluationError when matplotlib is missing or the folder cannot be written.
     """
@@ -36,21 +41,36 @@ def save_plots(reconstruction: ReconstructionLike, groundtruth: GroundTruth, fol
         ]
         if both:
             path = folder / f"depth_{camera}.png"
-            paths.append(save_depth_plot(reconstruction, groundtruth, camera, both[len(both) // 2], path))
+            paths.append(save_depth_plot(reconstruction, groundtruth, camera, spread(both), path))
     return paths
 
 
+def spread(frames: Sequence[int], count: int = DEPTH_FRAMES) -> list[int]:
+    """The middle frame of each of ``count`` equal stretches, every frame once."""
+    places = ((2 * np.arange(count) + 1) * len(frames)) // (2 * count)
+    return [frames[place] for place in dict.fromkeys(places.tolist())]
+
+
 def save_depth_plot(
-    reconstruction: ReconstructionLike, groundtruth: GroundTruth, camera: str, time: int, path: Path
+    reconstruction: ReconstructionLike,
+    groundtruth: GroundTruth,
+    camera: str,
+    times: Sequence[int],
+    path: Path,
 ) -> Path:
-    """Write the map of relative depth error of one frame, 0 to 0.25, as an image."""
-    figure, axes = _figure(1, 1, (6.0, 4.5))
-    shown = axes.imshow(
-        frame_depth_error(reconstruction, groundtruth, camera, time), vmin=0.0, vmax=0.25, cmap="magma"
-    )
-    axes.set_title(f"{camera} frame {time}: relative depth error")
-    axes.set_axis_off()
-    figure.colorbar(shown, ax=axes)
+    """Write the maps of relative depth error of some frames of one camera side by side.
+
+    Each after its own scale and offset, as Abs.Rel is taken; white where there is no true or no estimated
+    depth. Raises EvaluationError when matplotlib is missing or ``path`` cannot be written.
+    """
+    figure, row = _figure(1, len(times), (1.0 + 4.5 * len(times), 4.0))
+    for axes, time in zip(np.atleast_1d(row), times, strict=True):
+        error = frame_depth_error(reconstruction, groundtruth, camera, time)
+        shown = axes.imshow(error, vmin=0.0, vmax=WORST_SHOWN, cmap="magma")
+        mean = f"{np.nanmean(error):.3f}" if np.isfinite(error).any() else "-"
+        axes.set_title(f"{camera} frame {time}: Abs.Rel {mean}")
+        axes.set_axis_off()
+    figure.colorbar(shown, ax=row, label="relative depth error", extend="max")
     return _save(figure, path)
 
 

@@ -6,6 +6,11 @@ from rich.table import Table
 
 from mvdyn_gtsam.evaluation.scores import CameraScores, Scores
 
+COLUMNS = (
+    *("camera", "poses\n%", "ATE\nm", "RTE\nm", "RRE\ndeg"),
+    *("Abs.Rel", "d<1.25", "M_d\nm", "M_d m\nscale"),
+)
+
 
 def number(value: float | None, digits: int = 4) -> str:
     """A figure, or a dash where there is none."""
@@ -15,9 +20,13 @@ def number(value: float | None, digits: int = 4) -> str:
 def format_table(scores: Scores) -> Table:
     """One row per camera and one for all together; the caption holds what has no row."""
     table = Table(
-        title="Reconstruction against ground truth", caption="\n".join(_notes(scores)), caption_justify="left"
+        title="Reconstruction against ground truth",
+        caption="\n".join(_notes(scores)),
+        caption_justify="left",
+        # Two lines of heading and no edge keep the nine columns within a terminal of 80.
+        show_edge=False,
     )
-    for name in ("camera", "poses %", "ATE m", "RTE m", "RRE deg", "Abs.Rel", "d<1.25", "M_d m"):
+    for name in COLUMNS:
         table.add_column(name, justify="left" if name == "camera" else "right", no_wrap=True)
     rows: list[tuple[str, CameraScores | Scores]] = [*scores.per_camera.items(), ("all", scores)]
     for name, row in rows:
@@ -33,6 +42,7 @@ def format_table(scores: Scores) -> Table:
             number(depth.abs_rel if depth else None),
             number(depth.delta_1_25 if depth else None, 3),
             number(depth.m_d if depth else None),
+            number(depth.m_d_scale_only if depth else None),
             style="bold" if name == "all" else None,
         )
     return table
@@ -66,11 +76,17 @@ def _notes(scores: Scores) -> list[str]:
         notes.append(
             f"No depth for {depth.frames_without_estimate} of {depth.frames} frames with true depth."
         )
-    if depth is not None and depth.m_d_scale_only is not None:
-        notes.append(f"M_d after the full Sim(3); with the scale alone {number(depth.m_d_scale_only)} m.")
+    if depth is not None and depth.m_d is not None:
+        notes.append(
+            "M_d: median distance of corresponding points after the full Sim(3) (m_d), and in the cameras'"
+            " own frames after its scale alone (m_d_scale_only)."
+        )
     if depth is not None and depth.abs_rel_moving is not None:
         notes.append(
-            f"Abs.Rel of static pixels {number(depth.abs_rel_static)}, moving {number(depth.abs_rel_moving)}."
+            f"Static pixels: Abs.Rel {number(depth.abs_rel_static)}, d<1.25"
+            f" {number(depth.delta_1_25_static, 3)}, M_d {number(depth.m_d_static)} m;"
+            f" moving: {number(depth.abs_rel_moving)}, {number(depth.delta_1_25_moving, 3)},"
+            f" {number(depth.m_d_moving)} m."
         )
     if len(scores.groups) > 1:
         for group in scores.groups:

@@ -102,7 +102,8 @@ def _absolute_errors(gTc: Array, aligned: Array) -> Array:
 def _relative_errors(match: CameraMatch, aligned: Array) -> tuple[Array, Array]:
     """Translation (m) and rotation (deg) errors from each frame to the next: evo's RPE, delta of one frame.
 
-    Steps over a missing frame, or over a gap in the ground truth, are left out.
+    Steps over a missing frame, over a gap in the ground truth, and from one camera's last frame to the next
+    camera's first are left out: none of them is a step that a camera made.
     """
     metrics, trajectory = evo_module("core.metrics"), evo_module("core.trajectory")
     translation, rotation = [np.zeros(0)], [np.zeros(0)]

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mvdyn_gtsam.errors import EvaluationError
 from mvdyn_gtsam.evaluation.depth import fit_scale_and_offset, frame_depth_error
@@ -78,6 +79,7 @@ def test_figures_against_a_plain_computation(scene: Scene) -> None:
     }
     depth = evaluate(scene.reconstruction(depths), scene.folder).depth
     relative, moving, ratios, distances = [], [], [], []
+    moving_ratios, moving_distances, static_distances = [], [], []
     v, u = np.mgrid[:24, :32]
     ray_length = np.sqrt(((u - 15.5) / 40.0) ** 2 + ((v - 11.5) / 40.0) ** 2 + 1.0)
     for key in KEYS:
@@ -88,12 +90,31 @@ def test_figures_against_a_plain_computation(scene: Scene) -> None:
         moving.append(relative[-1][scene.masks[key]])
         ratios.append(np.maximum((s * e + o) / g, g / (s * e + o)))
         distances.append(np.abs(e - g) * ray_length)
+        moving_ratios.append(ratios[-1][scene.masks[key]])
+        moving_distances.append(distances[-1][scene.masks[key]])
+        static_distances.append(distances[-1][~scene.masks[key]])
     assert depth is not None
     assert depth.abs_rel == pytest.approx(np.mean(relative), rel=1e-5)
     assert depth.abs_rel_moving == pytest.approx(np.mean(moving), rel=1e-5)
     assert depth.delta_1_25 == pytest.approx(np.mean(np.array(ratios) < 1.25), abs=1e-9)
     assert depth.m_d == pytest.approx(np.median(distances), rel=1e-4)
     assert depth.m_d_scale_only == pytest.approx(np.median(distances), rel=1e-4)
+    assert depth.delta_1_25_moving == pytest.approx(np.mean(np.array(moving_ratios) < 1.25), abs=1e-9)
+    assert depth.m_d_moving == pytest.approx(np.median(moving_distances), rel=1e-4)
+    assert depth.m_d_static == pytest.approx(np.median(static_distances), rel=1e-4)
+
+
+def test_the_strict_distance_sees_the_pose_and_the_other_does_not(scene: Scene) -> None:
+    """Both cameras turned about their own centres: the Sim(3) of the positions stays the identity."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("y", 3.0, degrees=True).as_matrix()
+    exact = scene.reconstruction(scene.depths)
+    turned = {camera: wTc @ turn for camera, wTc in scene.truth.items()}
+    depth = evaluate(FakeReconstruction(turned, scene.depths), scene.folder).depth
+    reference = evaluate(exact, scene.folder).depth
+    assert depth is not None and reference is not None
+    assert depth.m_d is not None and 0.03 < depth.m_d < 0.3
+    assert depth.m_d_scale_only == pytest.approx(reference.m_d_scale_only, abs=1e-6)
 
 
 def test_static_and_moving_pixels_are_told_apart(scene: Scene) -> None:

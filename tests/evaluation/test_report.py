@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from mvdyn_gtsam.errors import EvaluationError
 from mvdyn_gtsam.evaluation import evaluate, format_table, load_groundtruth, save_depth_plot, save_plots
+from mvdyn_gtsam.evaluation.plots import spread
 from tests.evaluation.fakes import FakeReconstruction, perturbed, random_poses, write_groundtruth
 
 
@@ -26,6 +28,7 @@ def case(tmp_path: Path) -> tuple[FakeReconstruction, Path]:
 
 
 CONTRACT = {"registered", "ate_m", "rte_m", "rre_deg", "abs_rel", "delta_1_25", "m_d"}
+CONTRACT |= {"m_d_scale_only", "abs_rel_static", "abs_rel_moving", "m_d_static", "m_d_moving"}
 BETWEEN = {"inter_camera_trans_m", "inter_camera_rot_deg"}
 
 
@@ -49,11 +52,29 @@ def test_the_table_says_what_is_missing(case: tuple[FakeReconstruction, Path]) -
     assert "cam0" in text and "95.0" in text
 
 
+def test_the_table_names_both_distances_and_fits_a_terminal(
+    case: tuple[FakeReconstruction, Path],
+) -> None:
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(format_table(evaluate(*case)))
+    text = console.export_text()
+    assert "…" not in text
+    assert "m_d)" in text and "m_d_scale_only" in text
+    heading = text[: text.index("cam0")]
+    assert heading.count("M_d") == 2 and "scale" in heading
+
+
+def test_frames_of_a_plot_are_spread_over_time() -> None:
+    assert spread(list(range(10, 40)), 3) == [15, 25, 35]
+    assert spread([4, 7], 3) == [4, 7]
+    assert spread([4], 3) == [4]
+
+
 def test_plots_are_written(case: tuple[FakeReconstruction, Path], tmp_path: Path) -> None:
     reconstruction, folder = case
     groundtruth = load_groundtruth(folder)
     paths = save_plots(reconstruction, groundtruth, tmp_path / "plots")
-    paths.append(save_depth_plot(reconstruction, groundtruth, "cam0", 3, tmp_path / "plots" / "depth.png"))
+    paths.append(save_depth_plot(reconstruction, groundtruth, "cam0", [3], tmp_path / "plots" / "depth.png"))
     assert [path.name for path in paths] == ["trajectories.png", "error.png", "depth_cam0.png", "depth.png"]
     for path in paths:
         assert path.read_bytes().startswith(b"\x89PNG")

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import itertools
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from mvdyn_gtsam.geometry import Similarity
 from tests.evaluation.fakes import FakeReconstruction, perturbed, random_poses, random_similarity
 
 Array = npt.NDArray[np.float64]
+Alignment = Callable[[Array, Array], tuple[float, Array]]
 seeds = st.integers(0, 10_000)
 
 
@@ -35,12 +38,8 @@ def scene(seed: int, cameras: int = 2, frames: int = 12) -> tuple[dict[str, Arra
     return truth, {c: eSg.transform_poses(perturbed(rng, p, 0.02, 0.01)) for c, p in truth.items()}
 
 
-def independent_scores(
-    truth: dict[str, Array], estimate: dict[str, Array]
-) -> tuple[float, float, float, float, float]:
-    """ATE, RTE, RRE and the two inter-camera errors from numpy alone: Horn's quaternion method, no SVD."""
-    g = np.concatenate([p[:, :3, 3] for p in truth.values()])
-    e = np.concatenate([p[:, :3, 3] for p in estimate.values()])
+def horn_similarity(g: Array, e: Array) -> tuple[float, Array]:
+    """Scale and rotation of the positions ``(N, 3)`` by Horn's quaternion method: no SVD."""
     g0, e0 = g - g.mean(0), e - e.mean(0)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = e0.T @ g0
     horn = np.array(
@@ -53,24 +52,40 @@ def independent_scores(
     )
     w, x, y, z = np.linalg.eigh(horn)[1][:, -1]
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
-    scale = float(np.sum(g0 * (e0 @ rotation.T)) / np.sum(e0**2))
-    ate = np.sqrt(np.mean(np.sum((scale * e0 @ rotation.T - g0) ** 2, axis=1)))
-    relative = []
+    return float(np.sum(g0 * (e0 @ rotation.T)) / np.sum(e0**2)), rotation
+
+
+def umeyama_similarity(g: Array, e: Array) -> tuple[float, Array]:
+    """The same by the singular values, equations 38 to 43 of https://doi.org/10.1109/34.88573."""
+    g0, e0 = g - g.mean(0), e - e.mean(0)
+    u, singular, vt = np.linalg.svd(g0.T @ e0 / len(g))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return float(np.sum(singular * sign) / np.mean(np.sum(e0**2, axis=1))), u @ np.diag(sign) @ vt
+
+
+def independent_scores(
+    truth: dict[str, Array], estimate: dict[str, Array], similarity: Alignment
+) -> tuple[float, float, float, float, float]:
+    """ATE, RTE, RRE and the two inter-camera errors from numpy alone; NaN poses are missing."""
+    has = {c: np.isfinite(p[:, 0, 3]) for c, p in estimate.items()}
+    g = np.concatenate([truth[c][has[c], :3, 3] for c in truth])
+    e = np.concatenate([estimate[c][has[c], :3, 3] for c in truth])
+    scale, rotation = similarity(g, e)
+    residual = scale * (e - e.mean(0)) @ rotation.T - (g - g.mean(0))
+    relative, between = [], []
     for camera in truth:
-        for t in range(len(truth[camera]) - 1):
+        for t in np.flatnonzero(has[camera][:-1] & has[camera][1:]):
             true_step = np.linalg.inv(truth[camera][t]) @ truth[camera][t + 1]
             step = np.linalg.inv(estimate[camera][t]) @ estimate[camera][t + 1]
             relative.append(_difference(true_step, step, scale))
-    between = []
-    names = list(truth)
-    for a in range(len(names)):
-        for b in range(a + 1, len(names)):
-            for t in range(len(truth[names[a]])):
-                true_step = np.linalg.inv(truth[names[b]][t]) @ truth[names[a]][t]
-                step = np.linalg.inv(estimate[names[b]][t]) @ estimate[names[a]][t]
-                between.append(_difference(true_step, step, scale))
+    for a, b in itertools.combinations(truth, 2):
+        for t in np.flatnonzero(has[a] & has[b]):
+            true_step = np.linalg.inv(truth[b][t]) @ truth[a][t]
+            step = np.linalg.inv(estimate[b][t]) @ estimate[a][t]
+            between.append(_difference(true_step, step, scale))
     rte, rre = np.sqrt(np.mean(np.square(relative), axis=0))
     trans, rot = np.sqrt(np.mean(np.square(between), axis=0))
+    ate = np.sqrt(np.mean(np.sum(residual**2, axis=1)))
     return float(ate), float(rte), float(rre), float(trans), float(rot)
 
 
@@ -92,11 +107,30 @@ def figures(scores: Scores) -> tuple[float, ...]:
     return tuple(float("nan") if value is None else value for value in values)
 
 
-@given(seeds, st.integers(2, 4))
-def test_agrees_with_an_independent_implementation(seed: int, cameras: int) -> None:
+@given(
+    seeds,
+    st.integers(2, 4),
+    st.floats(-3.0, 3.0).map(lambda exponent: 10.0**exponent),
+    st.sampled_from([0.0, 1.0, 1e4]),
+    st.floats(0.0, 0.5),
+)
+def test_agrees_with_an_independent_implementation(
+    seed: int, cameras: int, scale: float, offset: float, missing: float
+) -> None:
     truth, estimate = scene(seed, cameras)
+    rng = np.random.default_rng(seed + 1)
+    turn = Rotation.random(random_state=rng).as_matrix()
+    eSe = Similarity(scale, turn, offset * max(1.0, scale) * rng.normal(size=3))
+    gSg = Similarity(1.0, np.eye(3), offset * rng.normal(size=3))
+    truth = {c: gSg.transform_poses(p) for c, p in truth.items()}
+    estimate = {c: eSe.transform_poses(p) for c, p in estimate.items()}
+    for poses in estimate.values():
+        # Two steps and one instant of all cameras stay, so that every figure exists.
+        poses[3:][rng.random(len(poses) - 3) < missing] = np.nan
     scores = evaluate_poses(FakeReconstruction(estimate), truth_of(truth))
-    np.testing.assert_allclose(figures(scores), independent_scores(truth, estimate), rtol=0, atol=1e-6)
+    for similarity in (horn_similarity, umeyama_similarity):
+        expected = independent_scores(truth, estimate, similarity)
+        np.testing.assert_allclose(figures(scores), expected, rtol=0, atol=1e-6)
 
 
 @given(seeds, st.sampled_from([1e-6, 1e-3, 1.0, 1e3, 1e6]))
