@@ -11,7 +11,6 @@ import platform
 import shlex
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -314,15 +313,9 @@ def captures_of(options: argparse.Namespace) -> list[Path]:
 
 def quick_scene(results: Path, cameras: int = QUICK_CAMERAS, frames: int = QUICK_FRAMES) -> Path:
     """The scene of ``--quick`` below ``results``, generated where it is not there yet."""
-    folder = results / "scenes" / f"quick_{cameras}x{frames}"
-    if not (folder / "capture.json").is_file():
-        from experiments.quick import quick_capture
+    from experiments.quick import quick_capture
 
-        # Made elsewhere and moved: a scene that was interrupted is not taken for a whole one.
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="partial-", dir=folder.parent) as partial:
-            quick_capture(Path(partial) / folder.name, cameras, frames).rename(folder)
-    return folder
+    return quick_capture(results / "scenes", cameras, frames)
 
 
 def settings_arguments(overrides: Sequence[str]) -> list[str]:

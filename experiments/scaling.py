@@ -115,17 +115,11 @@ def _write_long_truth(capture: Capture, source: Path, order: Sequence[int], out:
 
 def generate(cameras: int, frames: int, folder: Path) -> Path:
     """The generated scene of that size below ``folder``, made where it is not there yet."""
-    scene = folder / f"generated_{cameras}x{frames}"
-    if not (scene / "capture.json").is_file():
-        from mvdyn_gtsam.progress import NullProgress
-        from mvdyn_gtsam.scenes import SceneSettings, make_scene
+    from mvdyn_gtsam.scenes import SceneSettings, make_scene
 
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="partial-", dir=folder) as partial_folder:
-            made = Path(partial_folder) / scene.name
-            make_scene(SceneSettings(cameras=cameras, frames=frames), made, NullProgress())
-            made.rename(scene)
-    return scene
+    # Depth, masks and flow of the first frame alone: poses are what is scored.
+    settings = SceneSettings(cameras=cameras, frames=frames, every=frames)
+    return make_scene(settings, folder / f"generated_{cameras}x{frames}")
 
 
 @dataclass(frozen=True)

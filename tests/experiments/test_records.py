@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import types
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -143,25 +142,13 @@ def test_quick_never_touches_the_kept_results(words: list[str], capsys: pytest.C
     assert stopped.value.code == 2 and "--quick" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_the_scene_of_quick_is_made_once_and_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[Path] = []
-
-    def fake(folder: Path, cameras: int = 2, frames: int = 14) -> Path:
-        made.append(folder)
-        folder.mkdir(parents=True)
-        if len(made) == 1:
-            raise KeyboardInterrupt
-        (folder / "capture.json").write_text(f"{cameras} {frames}")
-        return folder
-
-    module = types.ModuleType("experiments.quick")
-    module.quick_capture = fake  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "experiments.quick", module)
+def test_quick_runs_on_a_generated_scene_below_the_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "experiments.quick.quick_capture", lambda folder, *size: folder / "x".join(map(str, size))
+    )
     options = parse(experiment_parser("name", None), ["--quick", "--results", str(tmp_path)])
-    with pytest.raises(KeyboardInterrupt):
-        captures_of(options)
-    assert list((tmp_path / "scenes").iterdir()) == []
-    for _ in range(2):
-        assert captures_of(options) == [tmp_path / "scenes" / "quick_2x14"]
-    assert len(made) == 2 and (tmp_path / "scenes" / "quick_2x14" / "capture.json").read_text() == "2 14"
-    assert [path.name for path in (tmp_path / "scenes").iterdir()] == ["quick_2x14"]
+    assert captures_of(options) == [tmp_path / "scenes" / "2x14"]
+    named = parse(experiment_parser("name", None), [str(tmp_path)])
+    assert captures_of(named) == [tmp_path]
