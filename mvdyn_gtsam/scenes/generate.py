@@ -15,10 +15,10 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.progress import NullProgress, Progress
-from mvdyn_gtsam.scenes.mesh import Mesh, build_mesh
+from mvdyn_gtsam.scenes.mesh import Instant, Mesh, View, build_mesh
 from mvdyn_gtsam.scenes.motion import Array, HandHeld
-from mvdyn_gtsam.scenes.render import Instant, Renderer
-from mvdyn_gtsam.scenes.rig import instants, make_cameras, neighbour_overlaps, solve_angle
+from mvdyn_gtsam.scenes.render import Renderer
+from mvdyn_gtsam.scenes.rig import make_cameras, neighbour_overlaps, probed_seconds, solve_angle
 from mvdyn_gtsam.scenes.settings import SceneSettings
 from mvdyn_gtsam.scenes.world import Body, body_poses
 from mvdyn_gtsam.scenes.writer import SceneWriter
@@ -53,14 +53,16 @@ class Scene:
         """``(C, 4, 4)`` of a frame."""
         return np.array([camera(self.seconds(time)) for camera in self.cameras])
 
-    def instant(self, time: int) -> Instant:
-        """Where everything is in a frame."""
-        return Instant.of(self.mesh, body_poses(self.bodies, self.seconds(time)))
+    def views(self, time: int) -> list[View]:
+        """Of every camera in a frame."""
+        instant = Instant(self.mesh, body_poses(self.bodies, self.seconds(time)))
+        return [View(instant, wTc) for wTc in self.wTc(time)]
 
     def overlaps(self) -> Array:
         """``(C - 1,)`` of neighbouring cameras, measured; see ``neighbour_overlaps``."""
-        wTb = [body_poses(self.bodies, seconds) for seconds in instants(self.settings)]
-        return neighbour_overlaps(self.settings, self.mesh, self.cameras, wTb)
+        times = probed_seconds(self.settings)
+        moments = [Instant(self.mesh, body_poses(self.bodies, seconds)) for seconds in times]
+        return neighbour_overlaps(self.settings, self.cameras, moments)
 
     def gain(self, camera: int, time: int) -> float:
         """Exposure of a frame, 1 for the true one."""
@@ -101,20 +103,20 @@ def _render(scene: Scene, writer: SceneWriter, progress: Progress) -> None:
     s = scene.settings
     renderer = Renderer(scene.mesh, s)
     moving: list[list[float]] = [[] for _ in scene.cameras]
-    here, poses = scene.instant(0), scene.wTc(0)
+    here = scene.views(0)
     for time in range(s.frames):
-        there, next_poses = scene.instant(time + 1), scene.wTc(time + 1)
+        there = scene.views(time + 1)
         for camera in range(s.cameras):
-            image = renderer.image(here, poses[camera])
+            image = renderer.image(here[camera])
             writer.write_image(camera, time, _exposed(scene, image, camera, time))
             if time % s.every == 0:
-                truth = renderer.truth(here, poses[camera])
+                truth = renderer.truth(here[camera])
                 writer.write_truth(camera, time, truth.depth, truth.moving)
                 moving[camera].append(float(truth.moving.mean()))
                 if time + 1 < s.frames:
-                    flow = renderer.flow(truth, (here, poses[camera]), (there, next_poses[camera]))
+                    flow = renderer.flow(truth, here[camera], there[camera])
                     writer.write_flow(camera, time, flow.flow, flow.visible)
-        here, poses = there, next_poses
+        here = there
         progress.update(STAGE, time + 1, s.frames)
     writer.finish(np.array([scene.wTc(time) for time in range(s.frames)]).swapaxes(0, 1))
     overlaps = scene.overlaps()

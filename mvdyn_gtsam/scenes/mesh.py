@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.errors import ConfigError
+from mvdyn_gtsam.geometry import invert_pose, transform_points
 from mvdyn_gtsam.scenes.motion import Array
 from mvdyn_gtsam.scenes.settings import SceneSettings
 from mvdyn_gtsam.scenes.textures import Atlas, Paint, build_atlas
@@ -43,16 +44,6 @@ class Mesh:
     moving: npt.NDArray[np.bool_]
     """``(B,)``"""
     atlas: Atlas
-
-    def world_vertices(self, wTb: Array) -> Array:
-        """``(V, 3)`` for the bodies at ``wTb (B, 4, 4)``."""
-        return _apply(wTb[self.vertex_body], self.vertices)
-
-    def shades(self, wTb: Array) -> npt.NDArray[np.float32]:
-        """Lambert shading ``(V,)`` of two far lights and some light from everywhere."""
-        normals = np.einsum("vij,vj->vi", wTb[self.vertex_body][:, :3, :3], self.normals)
-        lit = 0.55 + 0.4 * np.maximum(normals @ LIGHT, 0.0) + 0.2 * np.maximum(normals @ FILL, 0.0)
-        return lit.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -116,28 +107,48 @@ def build_mesh(bodies: Sequence[Body], settings: SceneSettings) -> Mesh:
     )
 
 
-class View:
-    """The mesh as one camera sees it at one instant: in camera coordinates, ready for rays."""
+class Instant:
+    """The mesh with every body where it is at one time, ready for rays from any camera."""
 
-    def __init__(self, mesh: Mesh, world_vertices: Array, cTw: Array) -> None:
-        """Raises ConfigError where the ray caster is not installed."""
+    def __init__(self, mesh: Mesh, wTb: Array) -> None:
+        """Bodies at ``wTb (B, 4, 4)``. Raises ConfigError where the ray caster is not installed."""
         self.mesh = mesh
-        self.vertices = world_vertices @ cTw[:3, :3].T + cTw[:3, 3]
+        self.wTb = wTb
+        self.vertices = _apply(wTb[mesh.vertex_body], mesh.vertices)
         self._scene = _embree_scene(self.vertices, mesh.faces)
 
+    def shades(self) -> npt.NDArray[np.float32]:
+        """Lambert shading ``(V,)`` by two far lights and some light from everywhere."""
+        normals = np.einsum("vij,vj->vi", self.wTb[self.mesh.vertex_body][:, :3, :3], self.mesh.normals)
+        lit = 0.55 + 0.4 * np.maximum(normals @ LIGHT, 0.0) + 0.2 * np.maximum(normals @ FILL, 0.0)
+        return lit.astype(np.float32)
+
+    def first_hits(self, origin: Array, directions: npt.NDArray[np.float32]) -> dict[str, Any]:
+        """Of rays from a point ``(3,)`` along ``(N, 3)``, world; lengths are in those of the directions."""
+        origins = np.broadcast_to(origin.astype(np.float32), directions.shape)
+        hits: dict[str, Any] = self._scene.run(np.ascontiguousarray(origins), directions, output=True)
+        return hits
+
+
+class View:
+    """What one camera sees at one instant."""
+
+    def __init__(self, instant: Instant, wTc: Array) -> None:
+        self.instant = instant
+        self.wTc = wTc
+
     def cast(self, rays: npt.NDArray[np.float32]) -> Hits:
-        """First hits of ``rays (N, 3)`` with ``z = 1`` from the camera's centre."""
-        hits: dict[str, Any] = self._scene.run(np.zeros_like(rays), rays, output=True)
-        face = hits["primID"]
-        depth = np.where(face == MISS, np.float32(np.inf), hits["tfar"])
-        return Hits(face, np.stack([hits["u"], hits["v"]], axis=1), depth)
+        """First hits of ``rays (N, 3)`` from the camera's centre, in its frame and with ``z = 1``."""
+        hits = self.instant.first_hits(self.wTc[:3, 3], rays @ self.wTc[:3, :3].T.astype(np.float32))
+        depth = np.where(hits["primID"] == MISS, np.float32(np.inf), hits["tfar"])
+        return Hits(hits["primID"], np.stack([hits["u"], hits["v"]], axis=1), depth)
 
     def exact_points(self, hits: Hits, rays: Array) -> Array:
         """Camera-frame points ``(N, 3)`` where the rays meet the planes of the faces they hit; NaN if none.
 
         The ray caster says which face, in single precision; where on it is computed here, in double.
         """
-        corners = self.vertices[self.mesh.faces]
+        corners = transform_points(invert_pose(self.wTc), self.instant.vertices)[self.instant.mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         offsets = np.einsum("fi,fi->f", normals, corners[:, 0])
         along = np.einsum("ni,ni->n", normals[hits.face], rays)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.geometry import invert_pose, pixel_rays, project
-from mvdyn_gtsam.scenes.mesh import MISS, Hits, Mesh, View
+from mvdyn_gtsam.scenes.mesh import MISS, Hits, Instant, Mesh, View
 from mvdyn_gtsam.scenes.motion import Array
 from mvdyn_gtsam.scenes.rig import visible
 from mvdyn_gtsam.scenes.settings import SceneSettings
@@ -43,22 +43,6 @@ class Flow:
     """``(H, W)``: inside the image there, and not hidden."""
 
 
-@dataclass(frozen=True)
-class Instant:
-    """Where everything is at one time."""
-
-    wTb: Array
-    """``(B, 4, 4)``"""
-    vertices: Array
-    """``(V, 3)`` m, world."""
-    shades: npt.NDArray[np.float32]
-    """``(V,)``"""
-
-    @staticmethod
-    def of(mesh: Mesh, wTb: Array) -> Instant:
-        return Instant(wTb, mesh.world_vertices(wTb), mesh.shades(wTb))
-
-
 class Renderer:
     """Casts the rays of every pixel; they are the same in every frame."""
 
@@ -68,10 +52,9 @@ class Renderer:
         self._centres = self._rays(1)
         self._samples = self._rays(SAMPLES).astype(np.float32)
 
-    def truth(self, instant: Instant, wTc: Array) -> Truth:
+    def truth(self, view: View) -> Truth:
         """Depth and motion at the pixel centres."""
         shape = (self._settings.height, self._settings.width)
-        view = View(self._mesh, instant.vertices, invert_pose(wTc))
         hits = view.cast(self._centres.astype(np.float32))
         points = view.exact_points(hits, self._centres)
         body = np.where(hits.face == MISS, -1, self._mesh.face_body[hits.face])
@@ -80,38 +63,35 @@ class Renderer:
             points[:, 2].reshape(shape), moving.reshape(shape), points.reshape(*shape, 3), body.reshape(shape)
         )
 
-    def image(self, instant: Instant, wTc: Array) -> npt.NDArray[np.float32]:
+    def image(self, view: View) -> npt.NDArray[np.float32]:
         """``(H, W, 3)`` RGB, 0 to 255, without noise."""
         s, n = self._settings, SAMPLES
-        view = View(self._mesh, instant.vertices, invert_pose(wTc))
         hits = view.cast(self._samples)
-        colors = self._colors(hits, instant, n)
+        colors = self._colors(hits, view.instant, n)
         sky = hits.face == MISS
         if sky.any():
             rays = self._samples[sky]
-            up = -(rays @ wTc[2, :3].astype(np.float32)) / np.linalg.norm(rays, axis=1)
+            up = -(rays @ view.wTc[2, :3].astype(np.float32)) / np.linalg.norm(rays, axis=1)
             share = np.clip(np.abs(up), 0.0, 1.0)[:, None]
             colors[sky] = share * SKY[0] + (1.0 - share) * SKY[1]
         return np.asarray(colors.reshape(s.height, n, s.width, n, 3).mean(axis=(1, 3)), dtype=np.float32)
 
-    def flow(self, truth: Truth, source: tuple[Instant, Array], target: tuple[Instant, Array]) -> Flow:
-        """Flow of the pixels of ``truth``, seen at ``source`` (where things are, wTc), to ``target``."""
+    def flow(self, truth: Truth, here: View, there: View) -> Flow:
+        """Flow of the pixels of ``truth``, taken ``here``, to where their points are ``there``."""
         s = self._settings
-        (here, wTc), (there, wTd) = source, target
         # One rigid motion per body takes camera coordinates here to camera coordinates there.
-        dTc = invert_pose(wTd) @ there.wTb @ invert_pose(here.wTb) @ wTc
+        dTc = invert_pose(there.wTc) @ there.instant.wTb @ invert_pose(here.instant.wTb) @ here.wTc
         motion = dTc[truth.body.ravel()]
         points = np.einsum("nij,nj->ni", motion[:, :3, :3], truth.points.reshape(-1, 3)) + motion[:, :3, 3]
         pixels, _ = project(points, s.intrinsics)
         grid = np.stack(np.meshgrid(np.arange(s.width), np.arange(s.height)), axis=-1)
         flow = pixels.reshape(s.height, s.width, 2) - grid
-        view = View(self._mesh, there.vertices, invert_pose(wTd))
-        return Flow(flow.astype(np.float32), visible(s, view, points).reshape(s.height, s.width))
+        return Flow(flow.astype(np.float32), visible(s, there, points).reshape(s.height, s.width))
 
     def _colors(self, hits: Hits, instant: Instant, samples: int) -> npt.NDArray[np.float32]:
         """``(N, 3)`` RGB; anything where nothing was hit."""
         mesh, s = self._mesh, self._settings
-        corners = np.concatenate([mesh.texels, instant.shades[:, None]], axis=1)[mesh.faces]
+        corners = np.concatenate([mesh.texels, instant.shades()[:, None]], axis=1)[mesh.faces]
         plane = np.stack(
             [corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=1
         )

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from mvdyn_gtsam.geometry import invert_pose, pixel_rays, project
-from mvdyn_gtsam.scenes.mesh import MISS, Mesh, View, build_mesh
+from mvdyn_gtsam.geometry import invert_pose, pixel_rays, project, transform_points
+from mvdyn_gtsam.scenes.mesh import MISS, Instant, View, build_mesh
 from mvdyn_gtsam.scenes.motion import Array, HandHeld
 from mvdyn_gtsam.scenes.settings import SceneSettings
 from mvdyn_gtsam.scenes.world import Body, body_poses, build_world
@@ -65,44 +65,42 @@ def solve_angle(settings: SceneSettings) -> tuple[float, list[Body]]:
 def _bisect_angle(settings: SceneSettings, world: Sequence[Body]) -> float:
     # Only the geometry counts, so nothing is painted.
     mesh = build_mesh(world, replace(settings, texture=0.0, focal=None, width=16, height=16))
-    wTb = [body_poses(world, seconds) for seconds in instants(settings)]
+    moments = [Instant(mesh, body_poses(world, seconds)) for seconds in probed_seconds(settings)]
     low, high = 0.0, min(1.4 * settings.field_of_view, math.pi)
     for _ in range(_STEPS):
         middle = (low + high) / 2
-        overlap = np.mean(neighbour_overlaps(settings, mesh, make_cameras(settings, middle), wTb))
+        overlap = np.mean(neighbour_overlaps(settings, make_cameras(settings, middle), moments))
         low, high = (middle, high) if overlap > settings.overlap else (low, middle)
     return low
 
 
-def instants(settings: SceneSettings) -> Array:
-    """``(INSTANTS,)`` s, over the length of the scene."""
+def probed_seconds(settings: SceneSettings) -> Array:
+    """``(INSTANTS,)`` s, over the length of the scene: when overlap is measured."""
     return np.linspace(0.0, (settings.frames - 1) / settings.fps, INSTANTS)
 
 
 def neighbour_overlaps(
-    settings: SceneSettings, mesh: Mesh, cameras: Sequence[HandHeld], wTb: Sequence[Array]
+    settings: SceneSettings, cameras: Sequence[HandHeld], moments: Sequence[Instant]
 ) -> Array:
     """``(C - 1,)``: share of the pixels of camera i whose surface camera i + 1 sees at that instant, averaged
-    with the reverse and over ``INSTANTS`` instants, where the bodies are at ``wTb``. Hidden is not seen."""
+    with the reverse and over ``moments``, those of ``probed_seconds``. What is hidden is not seen."""
     overlaps = np.zeros((INSTANTS, len(cameras) - 1))
-    for k, (seconds, poses) in enumerate(zip(instants(settings), wTb, strict=True)):
-        vertices = mesh.world_vertices(poses)
-        wTc = [camera(seconds) for camera in cameras]
-        views = [View(mesh, vertices, invert_pose(pose)) for pose in wTc]
+    for k, (seconds, moment) in enumerate(zip(probed_seconds(settings), moments, strict=True)):
+        views = [View(moment, camera(seconds)) for camera in cameras]
         for i in range(len(cameras) - 1):
-            there = _seen_share(settings, views[i], views[i + 1], invert_pose(wTc[i + 1]) @ wTc[i])
-            back = _seen_share(settings, views[i + 1], views[i], invert_pose(wTc[i]) @ wTc[i + 1])
+            there = _seen_share(settings, views[i], views[i + 1])
+            back = _seen_share(settings, views[i + 1], views[i])
             overlaps[k, i] = (there + back) / 2
     return overlaps.mean(axis=0)
 
 
-def _seen_share(settings: SceneSettings, view_i: View, view_j: View, jTi: Array) -> float:
+def _seen_share(settings: SceneSettings, view_i: View, view_j: View) -> float:
     x = np.linspace(0, settings.width - 1, PROBES)
     y = np.linspace(0, settings.height - 1, max(2, PROBES * settings.height // settings.width))
     rays = pixel_rays(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), settings.intrinsics)
     hits = view_i.cast(rays.astype(np.float32))
     points = view_i.exact_points(hits, rays)[hits.face != MISS]
-    seen = visible(settings, view_j, points @ jTi[:3, :3].T + jTi[:3, 3])
+    seen = visible(settings, view_j, transform_points(invert_pose(view_j.wTc) @ view_i.wTc, points))
     return float(seen.sum() / len(rays))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -64,7 +65,12 @@ class SceneWriter:
     ) -> None:
         """``(H, W, 2)`` px and ``(H, W)``."""
         rounded = (np.rint(flow / FLOW_STEP) * FLOW_STEP).astype(np.float32)
-        np.savez_compressed(self._truth("flow", camera, f"{time:06d}.npz"), flow=rounded, visible=visible)
+        path = self._truth("flow", camera, f"{time:06d}.npz")
+        # What np.savez_compressed writes, at a level three times as fast for a twentieth more.
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, array in (("flow", rounded), ("visible", visible)):
+                with archive.open(f"{name}.npy", "w") as member:
+                    np.lib.format.write_array(member, array)
 
     def finish(self, wTc: Array) -> None:
         """Write ``capture.json`` and the trajectories ``(C, T, 4, 4)``."""
