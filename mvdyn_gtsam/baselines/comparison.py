@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import logging
-import math
-import os
-import platform
 import shutil
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 
+from mvdyn_gtsam.baselines.masks import find_masks
 from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
-from mvdyn_gtsam.baselines.runner import log_path, read_result, run_worker
-from mvdyn_gtsam.baselines.settings import METHODS, BaselineSettings, Method, Request
+from mvdyn_gtsam.baselines.results import Comparison, MethodResult
+from mvdyn_gtsam.baselines.runner import log_path, run_worker
+from mvdyn_gtsam.baselines.settings import BASELINES, BaselineSettings, Request
+from mvdyn_gtsam.capture import Capture, open_capture
 from mvdyn_gtsam.errors import BaselineError, MvdynError
-from mvdyn_gtsam.evaluation import GroundTruth, Scores, evaluate, load_groundtruth
+from mvdyn_gtsam.evaluation import GroundTruth, ReconstructionLike, evaluate, load_groundtruth
+from mvdyn_gtsam.evaluation.comparison_plots import save_comparison_plots
 from mvdyn_gtsam.reconstruction import Reconstruction
+from mvdyn_gtsam.reconstruction.imports import load_result
 
 OURS = "ours"
 
@@ -32,87 +31,20 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class MethodResult:
-    """One row: a method that failed has a ``problem`` and no scores; it is never left out."""
+class _Inputs:
+    """What every method of one comparison is given."""
 
-    method: str
-    problem: str | None
-    scores: Scores | None
-    seconds: float | None
-    """Whole process, wall clock; with shared matches the time of these is counted for each method."""
-    cpu_seconds: float | None
-    """Of the method's own process, without what it took over from another."""
-    peak_mb: float | None
-    folder: Path
-    registered: float = 0.0
-    """Fraction of frames with a pose; a method that failed registered none."""
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """All methods on one capture."""
-
-    capture: str
-    results: tuple[MethodResult, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain JSON values; per method the contract's figures under ``scores``."""
-        return {
-            "capture": self.capture,
-            "machine": {"platform": platform.platform(), "cpu_count": os.cpu_count()},
-            "methods": [
-                {
-                    **{
-                        field.name: getattr(result, field.name)
-                        for field in dataclasses.fields(MethodResult)
-                        if field.name not in ("scores", "folder")
-                    },
-                    "folder": str(result.folder),
-                    "scores": None if result.scores is None else result.scores.to_json(),
-                }
-                for result in self.results
-            ],
-        }
-
-    def to_markdown(self) -> str:
-        """A table, and below it which methods failed or are incomplete."""
-        lines = ["| " + " | ".join(_COLUMNS) + " |", "|---|" + "---:|" * (len(_COLUMNS) - 1)]
-        lines += ["| " + " | ".join(_cells(result)) + " |" for result in self.results]
-        notes = [f"* {note}" for note in self._notes()]
-        return "\n".join([f"### {self.capture}", "", *lines, *([""] if notes else []), *notes]) + "\n"
-
-    def to_table(self) -> Table:
-        """The same for the terminal."""
-        # Must fit 80 columns: headings break before their unit, figures never break.
-        table = Table(title=self.capture, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-        for name in _COLUMNS:
-            heading = "\n".join(name.replace("inter-", "inter- ").split())
-            table.add_column(heading, justify="left" if name == "method" else "right", no_wrap=True)
-        for result in self.results:
-            table.add_row(*_cells(result))
-        table.caption = "\n".join(self._notes()) or None
-        table.caption_justify = "left"
-        return table
-
-    def _notes(self) -> list[str]:
-        notes = [f"{r.method} failed: {r.problem}" for r in self.results if r.problem is not None]
-        partial = [r.method for r in self.results if r.problem is None and r.registered < 1.0]
-        if partial:
-            notes.append(f"{', '.join(partial)}: incomplete; the errors leave out the frames without a pose.")
-        return notes
-
-
-_COLUMNS = (
-    "method",
-    "poses %",
-    "ATE m",
-    "RTE m",
-    "RRE deg",
-    "inter-camera m",
-    "inter-camera deg",
-    "s",
-    "peak MB",
-)
+    capture: Path
+    stage: str
+    truncate: bool
+    timeout_s: float | None
+    our_arguments: Sequence[str]
+    database: Path | None
+    settings: Mapping[str, BaselineSettings]
+    """Of each baseline."""
+    imported: Mapping[str, ReconstructionLike]
+    paths: Mapping[str, Path]
+    """Where the imported ones came from."""
 
 
 def compare(
@@ -121,51 +53,91 @@ def compare(
     methods: Sequence[str],
     out: Path,
     *,
+    imported: Mapping[str, Path] | None = None,
     stage: str = "tracking",
     settings: BaselineSettings | None = None,
+    database: Path | None = None,
     share_matches: bool = False,
     truncate: bool = False,
     timeout_s: float | None = None,
     our_arguments: Sequence[str] = (),
+    plots: bool = True,
     on_finished: Callable[[MethodResult], None] | None = None,
 ) -> Comparison:
-    """Run each method (``ours``, ``colmap``, ``glomap``) in a process of its own and score what it wrote.
+    """Run each method (``ours`` or one of ``BASELINES``) in a process of its own and score what it wrote.
 
     ``out/<method>`` holds each result, ``out/<method>.log`` what it said, ``out/compare.json`` and
     ``compare.md`` the table, written anew after each method so that an interrupted comparison keeps what was
-    done. Without ground truth only registration, time and memory are compared. ``our_arguments`` are added to
-    our command.
-    Raises BaselineError for an unknown method, EvaluationError for unusable ground truth; a method that fails
-    becomes a row that says so.
+    done; ``plots`` adds ``trajectories.png`` and ``error.png`` at the end. Without ground truth only
+    registration, time and memory are compared.
+
+    ``imported`` names results made elsewhere (``load_result`` reads them), which become rows without time
+    and memory. Of ``settings``, ``masks`` serves the masked baselines alone (see ``find_masks``),
+    ``descriptor`` and ``retrieval_pairs`` those with retrieval; ``pairing`` is the method's. With
+    ``database``, a folder that is kept, baselines of equal settings share frames, features and matches, in
+    this comparison and later ones of the same capture; ``share_matches`` does so for this one alone. What is
+    taken over counts in time and memory of each. ``our_arguments`` are added to our command.
+
+    Raises BaselineError for an unknown method and for masks or a descriptor that are missing, EvaluationError
+    for unusable ground truth, ResultError for an imported result that is none: all before anything runs. A
+    method that fails becomes a row that says so.
     """
-    known = (OURS, *METHODS)
-    for method in methods:
-        if method not in known:
-            raise BaselineError(f"method {method!r} is none of {', '.join(known)}")
-    if not methods:
-        raise BaselineError(f"no method to compare; choose from {', '.join(known)}")
+    paths = dict(imported or {})
+    methods = list(dict.fromkeys(methods))
+    _check_names(methods, paths)
     truth = None if groundtruth is None else load_groundtruth(groundtruth)
-    database = out / "matches" if share_matches else None
+    base = settings or BaselineSettings()
+    needs_capture = paths or any(BASELINES[m].masked for m in methods if m != OURS)
+    opened = open_capture(capture, truncate=truncate) if needs_capture else None
+    inputs = _Inputs(
+        capture=capture,
+        stage=stage,
+        truncate=truncate,
+        timeout_s=timeout_s,
+        our_arguments=our_arguments,
+        database=out / "matches" if share_matches and database is None else database,
+        settings={m: settings_of(m, base, opened, groundtruth) for m in methods if m != OURS},
+        imported={name: load_result(path, opened) for name, path in paths.items()} if opened else {},
+        paths=paths,
+    )
     results: list[MethodResult] = []
-    for method in dict.fromkeys(methods):
-        logger.info("%s: running", method)
-        folder = out / method
-        if method == OURS:
-            extra = [*(["--truncate"] if truncate else []), *our_arguments]
-            usage = _run_ours(capture, folder, stage, extra, timeout_s)
-            reused = 0.0
-        else:
-            name: Method = "colmap" if method == "colmap" else "glomap"
-            request = Request(capture, name, folder, settings or BaselineSettings(), database, truncate)
-            usage = run_worker(request, timeout_s)
-            reused = 0.0 if usage.problem else read_result(name, folder, usage).seconds - usage.seconds
-        results.append(_result(method, folder, usage, reused, truth))
+    name = Path(capture).resolve().name
+    for method in (*methods, *paths):
+        results.append(_row(method, inputs, out, truth))
         if on_finished is not None:
             on_finished(results[-1])
-        _write(Comparison(Path(capture).resolve().name, tuple(results)), out)
-    if database is not None:
-        shutil.rmtree(database, ignore_errors=True)
-    return Comparison(Path(capture).resolve().name, tuple(results))
+        _write(Comparison(name, tuple(results)), out)
+    if share_matches and database is None:
+        shutil.rmtree(out / "matches", ignore_errors=True)
+    if plots and truth is not None:
+        _plot(results, inputs, truth, out)
+    return Comparison(name, tuple(results))
+
+
+def settings_of(
+    method: str, base: BaselineSettings, capture: Capture | None, groundtruth: Path | None
+) -> BaselineSettings:
+    """Of the baseline called ``method``; what it has no use for is at its default, so that equal means equal.
+
+    Raises BaselineError where masks or the descriptor that it needs are missing.
+    """
+    baseline = BASELINES[method]
+    result = replace(
+        base, pairing=baseline.pairing, masks=None, descriptor=None,
+        retrieval_pairs=BaselineSettings.retrieval_pairs,
+    )  # fmt: skip
+    if baseline.masked and capture is not None:
+        result = replace(result, masks=find_masks(capture, base.masks, groundtruth))
+    if baseline.pairing == "retrieval":
+        if base.descriptor is None:
+            raise BaselineError(
+                f"{method} needs a global descriptor: give its ONNX model with --descriptor, or compare with"
+                f" {baseline.method}-exhaustive, which matches every frame with every other"
+            )
+        if not base.descriptor.is_file():
+            raise BaselineError(f"{base.descriptor}: there is no such ONNX model; check the path")
+        result = replace(result, descriptor=base.descriptor, retrieval_pairs=base.retrieval_pairs)
+    return result
 
 
 def our_command(capture: Path, folder: Path, stage: str, arguments: Sequence[str] = ()) -> list[str]:
@@ -176,6 +148,45 @@ def our_command(capture: Path, folder: Path, stage: str, arguments: Sequence[str
     ]
 
 
+def _check_names(methods: Sequence[str], imported: Mapping[str, Path]) -> None:
+    known = (OURS, *BASELINES)
+    for method in methods:
+        if method not in known:
+            raise BaselineError(
+                f"method {method!r} is none of {', '.join(known)}; a result made elsewhere is given as"
+                " --method NAME=PATH"
+            )
+    for name in imported:
+        if name in known:
+            raise BaselineError(f"--method {name}={imported[name]}: {name} is a method of its own; rename it")
+    if not methods and not imported:
+        raise BaselineError(
+            f"no method to compare; choose from {', '.join(known)}, or give --method NAME=PATH"
+        )
+
+
+def _row(method: str, inputs: _Inputs, out: Path, truth: GroundTruth | None) -> MethodResult:
+    if method in inputs.imported:
+        logger.info("%s: reading %s", method, inputs.paths[method])
+        return _result(method, inputs.paths[method], None, inputs, truth)
+    logger.info("%s: running", method)
+    folder = out / method
+    if method == OURS:
+        extra = [*(["--truncate"] if inputs.truncate else []), *inputs.our_arguments]
+        usage = _run_ours(inputs.capture, folder, inputs.stage, extra, inputs.timeout_s)
+    else:
+        request = Request(
+            inputs.capture,
+            BASELINES[method].method,
+            folder,
+            inputs.settings[method],
+            inputs.database,
+            inputs.truncate,
+        )
+        usage = run_worker(request, inputs.timeout_s)
+    return _result(method, folder, usage, inputs, truth)
+
+
 def _run_ours(
     capture: Path, folder: Path, stage: str, arguments: Sequence[str], timeout_s: float | None
 ) -> ProcessUsage:
@@ -184,27 +195,52 @@ def _run_ours(
 
 
 def _result(
-    method: str, folder: Path, usage: ProcessUsage, reused_seconds: float, truth: GroundTruth | None
+    method: str, folder: Path, usage: ProcessUsage | None, inputs: _Inputs, truth: GroundTruth | None
 ) -> MethodResult:
-    problem, scores, registered = usage.problem, None, 0.0
+    problem = None if usage is None else usage.problem
+    scores, registered = None, 0.0
     if problem is None:
         try:
-            reconstruction = Reconstruction.load(folder)
+            reconstruction = inputs.imported[method] if usage is None else Reconstruction.load(folder)
             registered = _registered(reconstruction)
             scores = None if truth is None else evaluate(reconstruction, truth)
         except MvdynError as error:
             problem = str(error)
     if problem is not None:
         logger.warning("%s failed: %s", method, problem)
-    seconds = usage.seconds + reused_seconds
     return MethodResult(
-        method, problem, scores, seconds, usage.cpu_seconds, usage.peak_mb, folder, registered
+        method=method,
+        problem=problem,
+        scores=scores,
+        seconds=None if usage is None else usage.seconds,
+        cpu_seconds=None if usage is None else usage.cpu_seconds,
+        peak_mb=None if usage is None else usage.peak_mb,
+        folder=folder,
+        registered=registered,
     )
 
 
-def _registered(reconstruction: Reconstruction) -> float:
+def _registered(reconstruction: ReconstructionLike) -> float:
     poses = np.concatenate([reconstruction.trajectory(camera)[1] for camera in reconstruction.cameras])
     return float(np.isfinite(poses).all(axis=(1, 2)).mean())
+
+
+def _plot(results: Sequence[MethodResult], inputs: _Inputs, truth: GroundTruth, out: Path) -> None:
+    scored = {
+        result.method: inputs.imported.get(result.method) or Reconstruction.load(result.folder)
+        for result in results
+        if result.scores is not None
+    }
+    if not scored:
+        return
+    if find_spec("matplotlib") is None:
+        logger.info("no plots: matplotlib is not installed (pip install mvdyn_gtsam[eval])")
+        return
+    try:
+        for path in save_comparison_plots(scored, truth, out):
+            logger.info("plot: %s", path)
+    except MvdynError as error:  # the table is written and worth more
+        logger.warning("%s", error)
 
 
 def _write(comparison: Comparison, out: Path) -> None:
@@ -214,22 +250,3 @@ def _write(comparison: Comparison, out: Path) -> None:
         (out / "compare.md").write_text(comparison.to_markdown())
     except OSError as error:
         raise BaselineError(f"{out}: the comparison cannot be written ({error.strerror})") from error
-
-
-def _cells(result: MethodResult) -> tuple[str, ...]:
-    scores = result.scores
-    figures = (
-        (None, 4) if scores is None else (scores.ate_m, 4),
-        (None, 4) if scores is None else (scores.rte_m, 4),
-        (None, 3) if scores is None else (scores.rre_deg, 3),
-        (None, 4) if scores is None else (scores.inter_camera_trans_m, 4),
-        (None, 3) if scores is None else (scores.inter_camera_rot_deg, 3),
-        (result.seconds, 1),
-        (result.peak_mb, 0),
-    )
-    name = result.method if result.problem is None else f"{result.method} (failed)"
-    return (name, f"{100 * result.registered:.1f}", *(_cell(value, digits) for value, digits in figures))
-
-
-def _cell(value: float | None, digits: int) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
 from mvdyn_gtsam.baselines.settings import METHODS, RESULT_NAME, BaselineSettings, Method, Request
+from mvdyn_gtsam.baselines.shared import SharedCost
 from mvdyn_gtsam.errors import BaselineError
 from mvdyn_gtsam.reconstruction import Reconstruction
 
@@ -28,10 +31,13 @@ class BaselineResult:
     registered: float
     """Fraction of all frames with a pose."""
     phases: Mapping[str, float]
-    """Seconds of ``frames``, ``features``, ``matching`` and ``mapping``."""
+    """Seconds of ``frames``, ``features``, ``matching``, ``mapping``; maybe ``masks``, ``retrieval``."""
     seconds: float
     """The whole process, plus the phases taken over from another method's run."""
+    cpu_seconds: float
+    """The same in user and system time."""
     peak_mb: float
+    """Of this process or of the one that made what it took over, whichever is more."""
     points: int
     """Sparse points of the model."""
 
@@ -48,9 +54,10 @@ def run_baseline(
 ) -> BaselineResult:
     """Reconstruct the capture folder with COLMAP (incremental) or GLOMAP (global mapping).
 
-    ``database`` names a folder where frames, features and matches are kept: the second method given the same
-    folder starts from them, and their time counts for both. The log is ``<out>.log``. Raises BaselineError,
-    with the reason in one line, when the method fails or finds no model; ResultError when ``out`` is in use.
+    ``database`` names a folder where frames, features and matches are kept: the next method given the same
+    folder, capture and settings starts from them, and their time and memory count for both. The log is
+    ``<out>.log``. Raises BaselineError, with the reason in one line, when the method fails or finds no model;
+    ResultError when ``out`` is in use.
     """
     if method not in METHODS:
         raise BaselineError(f"method {method!r} is none of {', '.join(METHODS)}")
@@ -62,11 +69,15 @@ def run_baseline(
 
 
 def run_worker(request: Request, timeout_s: float | None = None) -> ProcessUsage:
-    """As :func:`run_baseline`, but a failure is told in the usage and the result is left on disk."""
+    """As :func:`run_baseline`, but a failure is told in the usage and the result is left on disk.
+
+    The usage includes what the method took over from an earlier one.
+    """
     out = request.out
     # Not inside `out`: the worker accepts an empty folder or a reconstruction, nothing else.
     request_path = out.with_name(f"{out.name}.request.json")
     try:
+        (out / RESULT_NAME).unlink(missing_ok=True)  # of an earlier run
         out.parent.mkdir(parents=True, exist_ok=True)
         request_path.write_text(json.dumps(request.to_json()))
     except OSError as error:
@@ -74,7 +85,15 @@ def run_worker(request: Request, timeout_s: float | None = None) -> ProcessUsage
     command = [sys.executable, "-m", "mvdyn_gtsam.baselines.worker", str(request_path)]
     usage = run_measured(command, log_path(out), timeout_s=timeout_s)
     request_path.unlink()
-    return usage
+    if not (out / RESULT_NAME).is_file():
+        return usage  # it failed before there was anything to take over
+    reused = SharedCost.from_json(_read_json(out / RESULT_NAME)["reused"])
+    return dataclasses.replace(
+        usage,
+        seconds=usage.seconds + sum(reused.seconds.values()),
+        cpu_seconds=None if usage.cpu_seconds is None else usage.cpu_seconds + reused.cpu_seconds,
+        peak_mb=None if usage.peak_mb is None else max(usage.peak_mb, reused.peak_mb),
+    )
 
 
 def log_path(out: Path) -> Path:
@@ -84,10 +103,7 @@ def log_path(out: Path) -> Path:
 
 def read_result(method: Method, out: Path, usage: ProcessUsage) -> BaselineResult:
     """Read back what the worker wrote. Raises BaselineError when it is not there."""
-    try:
-        content = json.loads((out / RESULT_NAME).read_text())
-    except (OSError, ValueError) as error:
-        raise BaselineError(f"{out / RESULT_NAME}: cannot be read ({error})") from error
+    content = _read_json(out / RESULT_NAME)
     reconstruction = Reconstruction.load(out)
     trajectories = {camera: reconstruction.trajectory(camera)[1] for camera in reconstruction.cameras}
     found = np.concatenate([np.isfinite(wTc).all(axis=(1, 2)) for wTc in trajectories.values()])
@@ -97,7 +113,16 @@ def read_result(method: Method, out: Path, usage: ProcessUsage) -> BaselineResul
         trajectories=trajectories,
         registered=float(found.mean()),
         phases=content["phases"],
-        seconds=usage.seconds + sum(content["reused"].values()),
+        seconds=usage.seconds,
+        cpu_seconds=usage.cpu_seconds if usage.cpu_seconds is not None else float("nan"),
         peak_mb=usage.peak_mb if usage.peak_mb is not None else float("nan"),
         points=int(content["points"]),
     )
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise BaselineError(f"{path}: cannot be read ({error})") from error
+    return content

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +16,29 @@ METHODS: tuple[Method, ...] = ("colmap", "glomap")
 RESULT_NAME = "baseline.json"
 """What the worker leaves in its folder besides the reconstruction: seconds per phase, number of points."""
 
-Pairing = Literal["window", "exhaustive"]
+Pairing = Literal["window", "retrieval", "exhaustive"]
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """One row of the paper's tables: a mapper, what it matches, and whether moving things are masked."""
+
+    method: Method
+    pairing: Pairing = "window"
+    masked: bool = False
+
+
+BASELINES: Mapping[str, Baseline] = {
+    "colmap": Baseline("colmap"),
+    "glomap": Baseline("glomap"),
+    "colmap-masks": Baseline("colmap", masked=True),
+    "glomap-masks": Baseline("glomap", masked=True),
+    "colmap-retrieval": Baseline("colmap", pairing="retrieval"),
+    "glomap-retrieval": Baseline("glomap", pairing="retrieval"),
+    "colmap-exhaustive": Baseline("colmap", pairing="exhaustive"),
+    "glomap-exhaustive": Baseline("glomap", pairing="exhaustive"),
+}
+"""By name; ``exhaustive`` is a control of ours, every image with every other, and not in the paper."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +50,16 @@ class BaselineSettings:
     inter_window: int = 5
     """Frame i is matched with frames i-5 .. i+5 of every other camera."""
     pairing: Pairing = "window"
-    """``window`` as in the paper; ``exhaustive``: every image with every other, a control."""
+    """``window`` as in the paper; ``retrieval``: the windows, and what a global descriptor finds most similar
+    besides; ``exhaustive``: every image with every other, a control."""
     masks: Path | None = None
-    """Folder ``<camera>/<%06d>.png`` with 255 where something moves; no features are taken there."""
+    """Folder ``<camera>/<%06d>.png`` of every frame; no features are taken where it is above 127 (moving)."""
+    descriptor: Path | None = None
+    """ONNX model of a global descriptor, for ``retrieval``: one input ``(1, 3, H, W)`` float32, RGB in
+    [0, 1]; its first output is the descriptor, ``(1, D)``."""
+    retrieval_pairs: int = 20
+    """Frames retrieved for each, of those that the windows leave out. 20 is what hloc takes with NetVLAD for
+    image sequences (--num_loc of hloc/pipelines/RobotCar/pipeline.py); the paper does not say."""
     num_threads: int = -1
     """Threads of every phase; -1: all cores, which is also what our own method uses."""
     random_seed: int = 0
@@ -37,13 +67,12 @@ class BaselineSettings:
 
     def to_json(self) -> dict[str, Any]:
         values = dataclasses.asdict(self)
-        values["masks"] = None if self.masks is None else str(self.masks)
-        return values
+        return {key: str(value) if isinstance(value, Path) else value for key, value in values.items()}
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> BaselineSettings:
-        masks = values.get("masks")
-        return BaselineSettings(**{**values, "masks": None if masks is None else Path(masks)})
+        paths = {key: Path(values[key]) for key in ("masks", "descriptor") if values.get(key) is not None}
+        return BaselineSettings(**{**values, **paths})
 
 
 @dataclass(frozen=True)
@@ -55,7 +84,7 @@ class Request:
     out: Path
     settings: BaselineSettings
     database: Path | None = None
-    """Folder that keeps frames, features and matches, so that a second method can start from them."""
+    """Folder that keeps frames, features and matches of each capture and settings for other methods."""
     truncate: bool = False
 
     def to_json(self) -> dict[str, Any]:

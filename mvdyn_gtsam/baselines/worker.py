@@ -8,37 +8,20 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-import time
-from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.baselines import sfm
+from mvdyn_gtsam.baselines.retrieval import describe_images, retrieved_pairs
 from mvdyn_gtsam.baselines.settings import RESULT_NAME, Request
+from mvdyn_gtsam.baselines.shared import Phases, SharedCost, shared_folder
 from mvdyn_gtsam.capture import open_capture
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.errors import BaselineError, MvdynError
 from mvdyn_gtsam.reconstruction import CaptureInfo, ReconstructionWriter
-
-_SHARED_PHASES = ("frames", "features", "matching")
-
-Value = TypeVar("Value")
-
-
-class _Phases:
-    """Wall-clock seconds of each phase."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    def run(self, name: str, work: Callable[[], Value]) -> Value:
-        start = time.monotonic()
-        value = work()
-        self.seconds[name] = time.monotonic() - start
-        return value
 
 
 def run(request: Request) -> None:
@@ -49,7 +32,10 @@ def run(request: Request) -> None:
     capture = open_capture(request.capture, truncate=request.truncate)
     config = {"baseline": {"method": request.method, **request.settings.to_json()}}
     info = CaptureInfo.from_capture(capture)
-    work = request.database or request.out / "work"
+    if request.database is None:
+        work = request.out / "work"
+    else:
+        work = shared_folder(request.database, request, info, version("pycolmap"))
     with ReconstructionWriter.create(request.out, info, config, overwrite=True) as writer:
         try:
             _reconstruct(request, capture, work, writer)
@@ -59,7 +45,10 @@ def run(request: Request) -> None:
 
 
 def _reconstruct(request: Request, capture: Capture, work: Path, writer: ReconstructionWriter) -> None:
-    reused, phases = _match(request, capture, work)
+    phases = Phases()
+    reused = _match(request, capture, work, phases)
+    # Before mapping: a method that fails there took these phases over all the same.
+    _write_result(request, {**reused.seconds, **phases.seconds}, reused, points=None)
     # The mapper writes into the database; another method must find it as the matching left it.
     database = work / f"{request.method}.db"
     shutil.copyfile(work / "database.db", database)
@@ -76,39 +65,52 @@ def _reconstruct(request: Request, capture: Capture, work: Path, writer: Reconst
         model, [camera.name for camera in capture.cameras], capture.frame_count
     )
     _write(writer, capture, trajectories)
-    for name, seconds in {**reused, **phases.seconds}.items():
-        writer.finish_stage(name, seconds)
-    result = {"phases": {**reused, **phases.seconds}, "reused": reused, "points": model.num_points3D()}
-    (request.out / RESULT_NAME).write_text(json.dumps(result, indent=1))
+    seconds = {**reused.seconds, **phases.seconds}
+    for name, value in seconds.items():
+        writer.finish_stage(name, value)
+    _write_result(request, seconds, reused, points=model.num_points3D())
 
 
-def _match(request: Request, capture: Capture, work: Path) -> tuple[dict[str, float], _Phases]:
-    """Frames, features and matches in ``work``; seconds of phases done by an earlier run, and timers."""
-    phases, done_path = _Phases(), work / "phases.json"
-    key = {"capture": str(request.capture.resolve()), "settings": request.settings.to_json()}
+def _match(request: Request, capture: Capture, work: Path, phases: Phases) -> SharedCost:
+    """Frames, features and matches in ``work``; returns the cost of those that an earlier run had made."""
+    done_path = work / "phases.json"
     if done_path.is_file():
-        done = json.loads(done_path.read_text())
-        if done["key"] != key:
-            raise BaselineError(
-                f"{work}: holds matches of another capture or settings; choose another folder"
-            )
-        return {name: float(done["phases"][name]) for name in _SHARED_PHASES}, phases
+        return SharedCost.from_json(json.loads(done_path.read_text()))
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     settings, images, database = request.settings, work / "images", work / "database.db"
-    masks = None if settings.masks is None else work / "masks"
-    phases.run("frames", lambda: sfm.write_frames(capture, images))
-    if settings.masks is not None and masks is not None:
-        sfm.write_masks(capture, settings.masks, masks)
     count = capture.frame_count
+    phases.run("frames", lambda: sfm.write_frames(capture, images))
+    masks = None
+    if settings.masks is not None:
+        moving, masks = settings.masks, work / "masks"
+        phases.run("masks", lambda: sfm.write_masks(capture, moving, work / "masks"))
+    pairs = sfm.pairs_to_match([camera.name for camera in capture.cameras], count, settings)
+    if settings.pairing == "retrieval":
+        pairs += phases.run("retrieval", lambda: _retrieve(request, capture, images, pairs))
     phases.run(
         "features",
         lambda: sfm.extract_features(capture.cameras, count, images, database, settings, masks),
     )
-    pairs = sfm.pairs_to_match([camera.name for camera in capture.cameras], count, settings)
     phases.run("matching", lambda: sfm.match_features(pairs, database, settings))
-    done_path.write_text(json.dumps({"key": key, "phases": phases.seconds}))
-    return {}, phases
+    done_path.write_text(json.dumps(phases.cost().to_json()))
+    return SharedCost()
+
+
+def _retrieve(
+    request: Request, capture: Capture, images: Path, known: list[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    settings = request.settings
+    if settings.descriptor is None:
+        raise BaselineError("retrieval needs a global descriptor: give its ONNX model, or match exhaustively")
+    names = [sfm.image_name(camera.name, t) for camera in capture.cameras for t in range(capture.frame_count)]
+    descriptors = describe_images(settings.descriptor, images, names, settings.num_threads)
+    return retrieved_pairs(names, descriptors, settings.retrieval_pairs, known)
+
+
+def _write_result(request: Request, phases: dict[str, float], reused: SharedCost, points: int | None) -> None:
+    result = {"phases": phases, "reused": reused.to_json(), "points": points}
+    (request.out / RESULT_NAME).write_text(json.dumps(result, indent=1))
 
 
 def _write(

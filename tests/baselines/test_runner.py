@@ -1,15 +1,22 @@
 from __future__ import annotations
 
+import json
+import sqlite3
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
-from mvdyn_gtsam.baselines import BaselineSettings, run_baseline
+from mvdyn_gtsam.baselines import BaselineSettings, run_baseline, runner
+from mvdyn_gtsam.baselines.process import ProcessUsage
+from mvdyn_gtsam.baselines.settings import Request
+from mvdyn_gtsam.baselines.shared import SharedCost
 from mvdyn_gtsam.errors import BaselineError
 from mvdyn_gtsam.evaluation import evaluate
 from mvdyn_gtsam.reconstruction import Reconstruction
-from tests.baselines.scenes import write_capture
+from tests.baselines.scenes import HEIGHT, WIDTH, write_capture
+from tests.baselines.test_retrieval import write_model
 
 SETTINGS = BaselineSettings(num_threads=1)
 
@@ -43,11 +50,68 @@ def test_both_methods_place_the_cameras_of_a_tiny_scene(tmp_path: Path) -> None:
         assert scores.ate_m < 0.02 and scores.inter_camera_rot_deg is not None
         assert scores.inter_camera_rot_deg < 0.3
         assert reconstruction.groups == [["cam0", "cam1"]]
-    assert results["colmap"].phases["matching"] == results["glomap"].phases["matching"]
-    with pytest.raises(BaselineError, match="matches of another capture or settings"):
-        run_baseline(
-            capture, "glomap", tmp_path / "other", settings=BaselineSettings(inter_window=1), database=matches
+    first, second = results["glomap"], results["colmap"]
+    assert second.phases["matching"] == first.phases["matching"]  # shared, and counted for both
+    (work,) = matches.iterdir()
+    taken_over = SharedCost.from_json(json.loads((work / "phases.json").read_text()))
+    assert second.seconds > sum(taken_over.seconds.values()) + second.phases["mapping"]
+    assert second.cpu_seconds > taken_over.cpu_seconds > 0.1
+    assert second.peak_mb >= taken_over.peak_mb > 50.0
+    other = run_baseline(
+        capture, "glomap", tmp_path / "other", settings=BaselineSettings(inter_window=1), database=matches
+    )
+    assert other.phases["matching"] != first.phases["matching"]  # of other settings, never shared
+    assert len(list(matches.iterdir())) == 2
+
+
+@pytest.mark.slow
+def test_retrieval_and_masks_reach_the_matcher(tmp_path: Path) -> None:
+    capture, masks = tmp_path / "capture", tmp_path / "moving"
+    write_capture(capture, frames=4)
+    for path in (masks / f"cam{c}" / f"{t:06d}.png" for c in range(2) for t in range(4)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[:, :40] = 255
+        assert cv2.imwrite(str(path), mask)
+    model = write_model(tmp_path / "mean.onnx", [1, 3, "h", "w"], "mean")
+    settings = BaselineSettings(
+        intra_window=1, inter_window=0, pairing="retrieval", descriptor=model, retrieval_pairs=2, masks=masks,
+        num_threads=1,
+    )  # fmt: skip
+    database = tmp_path / "matches"
+    result = run_baseline(capture, "glomap", tmp_path / "out", settings=settings, database=database)
+    assert result.registered == 1.0
+    assert set(result.phases) == {"frames", "masks", "retrieval", "features", "matching", "mapping"}
+    (work,) = database.iterdir()
+    lines = (work / "database.pairs.txt").read_text().splitlines()
+    assert len(set(lines)) == len(lines)
+    windows = 2 * 3 + 4
+    assert windows + 8 * 2 // 2 <= len(lines) <= windows + 8 * 2
+    with sqlite3.connect(work / "database.db") as connection:
+        stored = connection.execute("SELECT rows, cols, data FROM keypoints").fetchall()
+    for rows, columns, data in stored:
+        assert (np.frombuffer(data, np.float32).reshape(rows, columns)[:, 0] >= 39).all()
+
+
+def test_what_was_taken_over_counts_even_for_a_method_that_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "colmap"
+    out.mkdir()
+    (out / "baseline.json").write_text("of an earlier run")
+
+    def measured(*_: object, **__: object) -> ProcessUsage:
+        assert not (out / "baseline.json").exists()
+        cost = SharedCost({"matching": 30.0, "features": 4.0}, cpu_seconds=60.0, peak_mb=900.0)
+        (out / "baseline.json").write_text(
+            json.dumps({"phases": {}, "reused": cost.to_json(), "points": None})
         )
+        return ProcessUsage(1, 12.5, 11.0, 640.0, "colmap found no model (exit code 1)")
+
+    monkeypatch.setattr(runner, "run_measured", measured)
+    usage = runner.run_worker(Request(tmp_path, "colmap", out, SETTINGS))
+    assert (usage.seconds, usage.cpu_seconds, usage.peak_mb) == (46.5, 71.0, 900.0)
+    assert usage.problem is not None
 
 
 @pytest.mark.slow

@@ -90,3 +90,14 @@ def test_finished_runs_are_not_run_again(tmp_path: Path, monkeypatch: pytest.Mon
     text = (tmp_path / "accuracy.md").read_text()
     assert all(f"| clip | {method} |" in text for method in accuracy.METHODS)
     assert "10.0 (colmap)" in (tmp_path / "accuracy_against_best.md").read_text()
+
+
+def test_a_baseline_run_anew_matches_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(accuracy, "measure", lambda _capture, method, *_: entry(method, 0.01, 1.0))
+    clip, work = tmp_path / "clip", tmp_path / "work"
+    matches = accuracy.matches_folder(work, clip)
+    for folder in (clip, matches):
+        folder.mkdir(parents=True)
+    words = [str(clip), "--results", str(tmp_path), "--work", str(work)]
+    assert accuracy.main([*words, "--again", "ours"]) == 0 and matches.is_dir()
+    assert accuracy.main([*words, "--again", "glomap"]) == 0 and not matches.exists()

@@ -47,7 +47,7 @@ def assert_same_scene(imported: ImportedResult | Reconstruction, known: Reconstr
             np.testing.assert_allclose(pixels, PIXELS, atol=1e-6)
 
 
-def write_npz(folder: Path, poses: Mapping[str, np.ndarray], **more: Any) -> Path:
+def write_npz(folder: Path, poses: Mapping[str, Any], **more: Any) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / "poses.npz", **poses, **more)
     return folder
