@@ -14,7 +14,7 @@ from typing import NoReturn
 from rich.console import Console
 from rich.logging import RichHandler
 
-from mvdyn_gtsam.cli import compare, config, demo, evaluate, export, reconstruct
+from mvdyn_gtsam.cli import batch, compare, config, demo, evaluate, export, reconstruct, scene
 from mvdyn_gtsam.errors import MvdynError
 
 EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERNAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
@@ -33,7 +33,7 @@ start here:
 
 exit codes: 0 done, 1 failed (one line says why), 2 wrong command line, 3 a bug, 130 interrupted"""
 
-VERBS = (reconstruct, evaluate, compare, export, demo, config)
+VERBS = (reconstruct, batch, evaluate, compare, export, demo, scene, config)
 
 
 class _Parser(argparse.ArgumentParser):
