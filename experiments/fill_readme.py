@@ -1,7 +1,8 @@
 """Put the pages of experiments/results/ into the README's table slots.
 
 A slot is what stands between `<!-- table: NAME -->` and `<!-- end: NAME -->`; the page's command and tables
-replace it, the page's title is left out. Slots whose page does not exist are left as they are and named.
+replace it, the page's title and plot are left out. Slots whose page does not exist are left as they are and
+named.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ PAGES = {
     "accuracy": "accuracy.md",
     "refinement": "refinement_phases.md",
     "start": "wide_baseline.md",
-    "memory": "memory_growth.md",
+    "memory": "scaling_frames.md",
 }
 """Slot -> page."""
 
@@ -30,7 +31,8 @@ def fill(text: str, pages: Mapping[str, str]) -> str:
         slot = re.compile(rf"(<!-- table: {re.escape(name)} -->\n).*?(<!-- end: {re.escape(name)} -->)", re.S)
         if not slot.search(text):
             raise ExperimentError(f"there is no slot between <!-- table: {name} --> and <!-- end: {name} -->")
-        body = re.sub(r"\A# .*\n+", "", page).strip("\n")
+        # A plot's path is that from the page, and the README has pictures of its own.
+        body = re.sub(r"\A# .*\n+|^!\[[^\]]*\]\([^)]*\)\n", "", page, flags=re.M).strip("\n")
         text = slot.sub(lambda found, body=body: f"{found[1]}\n{body}\n\n{found[2]}", text)  # type: ignore[misc]
     return text
 

@@ -66,6 +66,8 @@ def lines(axes: Axes, entries: Entries, over: Value, series: Mapping[str, Value]
         )
         if points:
             axes.plot(*zip(*points, strict=True), marker="o", label=name)
+    # What was measured, and no number between.
+    axes.set_xticks(sorted({place for entry in entries if (place := over(entry)) is not None}))
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.set_ylim(bottom=0.0)

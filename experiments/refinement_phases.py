@@ -39,14 +39,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NAME = "refinement_phases"
+TRACKING, FULL = "tracking", "phases 1, 2"
 VARIANTS: dict[str, tuple[str, ...]] = {
-    "tracking": (),
+    TRACKING: (),
     "phase 1": ("refinement.phase2=false",),
-    "phases 1, 2": (),
+    FULL: (),
     "joint": ("refinement.joint=true",),
 }
 """Settings of each; the first is not refined at all."""
-TRACKING = "tracking"
 ON_TRACKING = "refinement_on_tracking"
 FLOW_STEPS = ("temporal flow", "wide flow")
 COLUMNS = (
@@ -70,13 +70,13 @@ def measure(
     capture: Path, variant: str, work: Path, kept: Path | None, overrides: Sequence[str]
 ) -> dict[str, Any]:
     """Track where that was not done yet, refine a copy, score it."""
-    tracked = work / capture.resolve().name / "tracking"
+    tracked = folder_of(work, capture, TRACKING)
     if kept is not None and not tracked.exists():
         shutil.copytree(kept / capture.resolve().name / "ours" / "ours", tracked)
     usage = _track(capture, tracked)
     folder, seconds = tracked, {}
     if variant != TRACKING:
-        folder = work / capture.resolve().name / variant.replace(" ", "_").replace(",", "")
+        folder = folder_of(work, capture, variant)
         if folder.exists():
             shutil.rmtree(folder)
         shutil.copytree(tracked, folder)
@@ -95,6 +95,11 @@ def measure(
         "step_seconds": seconds,
         "scores": scores,
     }
+
+
+def folder_of(work: Path, capture: Path, variant: str) -> Path:
+    """Where ``measure`` leaves the reconstruction of a variant."""
+    return work / capture.resolve().name / variant.replace(" ", "_").replace(",", "")
 
 
 def _track(capture: Path, folder: Path) -> ProcessUsage | None:

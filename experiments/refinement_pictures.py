@@ -1,6 +1,7 @@
 """Pictures of a refined result: depth before and after, and the points of one instant from above.
 
-From above, walls should be straight and thin and what two cameras see should lie in one place.
+From above, walls should be straight and thin and what two cameras see should lie in one place. --quick draws
+the tiny generated scene, refined by experiments.refinement_phases where that was not done yet.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from experiments.records import ROOT
+from experiments import refinement_phases
+from experiments.records import QUICK, QUICK_FRAMES, ROOT, ExperimentError, quick_scene
 from mvdyn_gtsam.capture import Capture, load_capture
 from mvdyn_gtsam.errors import MvdynError
 from mvdyn_gtsam.geometry import backproject, invert_pose, transform_points
@@ -93,26 +95,49 @@ def _points(
     return backproject(pixels, depth[rows, cols].astype(np.float64), source.intrinsics(name))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw both pictures."""
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    result = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("result", type=Path, help="refined result of that capture")
-    parser.add_argument("--frames", nargs="+", type=int, default=[30], help="default: 30")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "pictures", metavar="DIR")
-    options = parser.parse_args(arguments)
+    result.add_argument("capture", type=Path, nargs="?")
+    result.add_argument("result", type=Path, nargs="?", help="refined result of that capture")
+    result.add_argument("--quick", action="store_true", help="of a tiny generated scene, into out/quick")
+    result.add_argument("--frames", nargs="+", type=int, help="default: 30, or 7 of --quick")
+    result.add_argument("--out", type=Path, metavar="DIR", help="default: docs/pictures, or out/quick")
+    return result
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw both pictures."""
+    command_line = parser()
+    options = command_line.parse_args(arguments)
+    if options.quick == (options.result is not None):
+        command_line.error("name a capture and its refined result, or give --quick")
+    out = options.out or (QUICK if options.quick else ROOT / "docs" / "pictures")
+    frames = options.frames or ([QUICK_FRAMES // 2] if options.quick else [30])
     try:
-        capture, result = load_capture(options.capture), Reconstruction.load(options.result)
-        options.out.mkdir(parents=True, exist_ok=True)
-        depth_picture(capture, result, options.frames, options.out / f"depth_{capture.name}.jpg")
-        points_picture(capture, result, options.frames[0], options.out / f"points_{capture.name}.jpg")
+        folders = _quick(out) if options.quick else (options.capture, options.result)
+        capture, result = load_capture(folders[0]), Reconstruction.load(folders[1])
+        if max(frames) >= capture.frame_count:
+            raise ExperimentError(f"{capture.name}: has {capture.frame_count} frames, no frame {max(frames)}")
+        out.mkdir(parents=True, exist_ok=True)
+        depth_picture(capture, result, frames, out / f"depth_{capture.name}.jpg")
+        points_picture(capture, result, frames[0], out / f"points_{capture.name}.jpg")
     except MvdynError as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    sys.stderr.write(f"written: {options.out}\n")
+    sys.stderr.write(f"written: {out}\n")
     return 0
+
+
+def _quick(out: Path) -> tuple[Path, Path]:
+    """The scene of ``--quick`` and its refined result. Raises ExperimentError where it cannot be refined."""
+    capture, work = quick_scene(out), out / "work" / refinement_phases.NAME
+    folder = refinement_phases.folder_of(work, capture, refinement_phases.FULL)
+    if not (folder.is_dir() and "refinement" in Reconstruction.load(folder).stages):
+        refinement_phases.measure(capture, refinement_phases.FULL, work, None, [])
+    return capture, folder
 
 
 if __name__ == "__main__":

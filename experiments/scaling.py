@@ -191,13 +191,13 @@ def measure(size: Size, options: argparse.Namespace) -> dict[str, Any]:
 
 def _what_it_says(result: Reconstruction, capture: Path) -> dict[str, Any]:
     """Seconds by phase, and scores where there is ground truth."""
-    from mvdyn_gtsam.evaluation import evaluate_poses
+    from mvdyn_gtsam.evaluation import evaluate
 
     truth = capture / "groundtruth"
     return {
         "phase_seconds": {stage["name"]: stage["seconds"] for stage in result.manifest["stages"]},
         "tracking_seconds": result.diagnostics("seconds"),
-        "scores": evaluate_poses(result, truth).to_json() if truth.is_dir() else None,
+        "scores": evaluate(result, truth).to_json() if truth.is_dir() else None,
     }
 
 
@@ -266,19 +266,28 @@ def render(study: str, entries: Entries) -> str:
     what = (
         f"{names} played forwards and backwards" if study == "frames" else f"{names}: the scene of each row"
     )
-    failed = [
-        f"* {entry['cameras']} x {entry['frames']}: {entry['problem']}\n"
-        for entry in entries
-        if entry["problem"] is not None
-    ]
     return (
         f"{what}; interpreter and libraries alone take {figure(entries[-1]['libraries_mb'], 0)} MB. Goal:"
         f" at most {GOAL_MB:.0f} MB above them, growing no more than the result. Phases in seconds per image,"
         " MB are MiB; commit "
         f"{', '.join(sorted({str(entry['commit']) for entry in entries}))}.\n\n"
         + table(COLUMNS, rows(entries))
-        + "".join(["\n", *failed] if failed else [])
+        + _notes(entries)
     )
+
+
+def _notes(entries: Entries) -> str:
+    """Failures and cameras left apart, below the table."""
+    lines = []
+    for entry in entries:
+        size = f"* {entry['cameras']} x {entry['frames']}"
+        groups = ((entry.get("scores") or {}).get("groups")) or []
+        if entry["problem"] is not None:
+            lines.append(f"{size}: {entry['problem']}")
+        elif len(groups) > 1:
+            names = " / ".join("+".join(group["cameras"]) for group in groups)
+            lines.append(f"{size}: the start leaves cameras apart ({names}); ATE over all means little")
+    return "".join(f"\n{line}" for line in lines) + ("\n" if lines else "")
 
 
 def draw(study: str, picture: Figure, entries: Entries) -> None:

@@ -19,6 +19,11 @@ def test_a_page_replaces_the_old_one_and_its_title_is_left_out() -> None:
     assert "command" not in fill(once, {"time": "# Other\n\nnew\n"})
 
 
+def test_plots_of_a_page_stay_where_they_are() -> None:
+    filled = fill(TEXT, {"time": "# Title\n\n| a |\n\n![Title](time.png)\n"})
+    assert filled == "before\n<!-- table: time -->\n\n| a |\n\n<!-- end: time -->\nafter\n"
+
+
 def test_a_missing_slot_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ExperimentError, match="start"):
         fill(TEXT, {"start": "page"})

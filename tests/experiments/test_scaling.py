@@ -111,6 +111,8 @@ def test_a_failure_is_named_below_the_table_and_left_out_of_the_plot() -> None:
     failed = entry(200, 0.0, 0.0, 5.0, problem="out of memory", peak_mb=None, scores=None)
     text = scaling.render("frames", [entry(150, 900.0, 100.0, 90.0), failed])
     assert "* 2 x 200: out of memory" in text
+    apart = entry(150, 900.0, 1.0, 9.0, scores={"groups": [{"cameras": ["cam0"]}, {"cameras": ["cam1"]}]})
+    assert "* 2 x 150: the start leaves cameras apart (cam0 / cam1)" in scaling.render("frames", [apart])
     figure = Figure()
     scaling.draw("frames", figure, [entry(150, 900.0, 100.0, 90.0), failed])
     seconds, memory, error = figure.axes
