@@ -119,7 +119,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, messages: Console) -> int:
     """Run the verb."""
-    from mvdyn_gtsam.baselines import BASELINES, BaselineSettings, compare
+    from mvdyn_gtsam.baselines import BaselineSettings, compare
     from mvdyn_gtsam.config import load_config
 
     load_config(None, arguments.overrides)  # a mistake here must not cost a run
@@ -127,18 +127,7 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
     imported = read_imported(arguments.imported)
     if not arguments.capture.exists():
         raise CaptureError(f"{arguments.capture}: there is no such file or folder; check the path")
-    for option, value, wanted in (
-        ("--masks", arguments.masks, [name for name, one in BASELINES.items() if one.masked]),
-        (
-            "--descriptor",
-            arguments.descriptor,
-            [name for name, one in BASELINES.items() if one.pairing == "retrieval"],
-        ),
-    ):
-        if value is not None and not set(wanted) & set(methods):
-            raise BaselineError(f"{option} {value}: has no use here; add {' or '.join(wanted)} to --methods")
-    if arguments.retrieval_pairs < 1:
-        raise BaselineError(f"--retrieval-pairs {arguments.retrieval_pairs}: must be at least 1")
+    _check_options(arguments, methods)
     groundtruth = arguments.groundtruth
     if groundtruth is None and (arguments.capture / "groundtruth").is_dir():
         groundtruth = arguments.capture / "groundtruth"
@@ -170,6 +159,22 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
         log = "" if method in imported else f"; see {arguments.out / f'{method}.log'}"
         raise BaselineError(f"{method} failed: {failed[method]}{log}")
     return 0
+
+
+def _check_options(arguments: argparse.Namespace, methods: list[str]) -> None:
+    """Raises BaselineError for an option that no method has a use for."""
+    from mvdyn_gtsam.baselines import BASELINES
+
+    masked = [name for name, one in BASELINES.items() if one.masked]
+    retrieval = [name for name, one in BASELINES.items() if one.pairing == "retrieval"]
+    for option, value, wanted in (
+        ("--masks", arguments.masks, masked),
+        ("--descriptor", arguments.descriptor, retrieval),
+    ):
+        if value is not None and not set(wanted) & set(methods):
+            raise BaselineError(f"{option} {value}: has no use here; add {' or '.join(wanted)} to --methods")
+    if arguments.retrieval_pairs < 1:
+        raise BaselineError(f"--retrieval-pairs {arguments.retrieval_pairs}: must be at least 1")
 
 
 def read_imported(words: list[str]) -> dict[str, Path]:
