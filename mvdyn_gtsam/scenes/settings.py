@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, fields
-
-import numpy as np
-import numpy.typing as npt
+from numbers import Real
+from typing import TYPE_CHECKING
 
 from mvdyn_gtsam.errors import ConfigError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
 PLACES = ("room", "yard")
 FORMATS = ("png", "mp4")
@@ -78,7 +81,8 @@ class SceneSettings:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name in _RANGES and not (field.name == "focal" and value is None):
-                _check(field.name, value, "int" in str(field.type))
+                number = _checked(field.name, value, "int" in str(field.type))
+                object.__setattr__(self, field.name, number)
         for name, value, known in (("place", self.place, PLACES), ("format", self.format, FORMATS)):
             if value not in known:
                 raise ConfigError(f"{name} {value!r}: must be one of {', '.join(known)}")
@@ -98,6 +102,8 @@ class SceneSettings:
     @property
     def intrinsics(self) -> npt.NDArray[np.float64]:
         """``(3, 3)``, the principal point in the middle of the image: ``(W-1)/2, (H-1)/2``."""
+        import numpy as np  # here: the command line reads the defaults before anything heavy is needed
+
         f = self.focal_length
         return np.array([[f, 0.0, (self.width - 1) / 2], [0.0, f, (self.height - 1) / 2], [0.0, 0.0, 1.0]])
 
@@ -107,9 +113,10 @@ class SceneSettings:
         return content
 
 
-def _check(name: str, value: object, whole: bool) -> None:
+def _checked(name: str, value: object, whole: bool) -> int | float:
     low, high = _RANGES[name]
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not number or not low <= value <= high or (whole and value != int(value)):  # type: ignore[operator,call-overload]
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    if not low <= number <= high or (whole and number != int(number)):
         kind = "a whole number" if whole else "a number"
         raise ConfigError(f"{name} {value}: must be {kind} from {low:g} to {high:g}")
+    return int(number) if whole else number

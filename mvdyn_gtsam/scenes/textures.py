@@ -100,18 +100,19 @@ def _texels(paint: Paint) -> tuple[int, int]:
 
 def _painted(paint: Paint) -> npt.NDArray[np.uint8]:
     """``(h, w, 3)`` RGB."""
-    rng = np.random.default_rng(paint.seed)
+    # Two streams, because how many numbers the noise takes depends on the resolution.
+    rng, fine = (np.random.default_rng([*paint.seed, stream]) for stream in (0, 1))
     w, h = _texels(paint)
-    base = np.array(colorsys.hsv_to_rgb(rng.random(), 0.15 + 0.4 * rng.random(), 0.5 + 0.35 * rng.random()))
+    base = np.array(colorsys.hsv_to_rgb(rng.random(), 0.08 + 0.32 * rng.random(), 0.5 + 0.35 * rng.random()))
     color = np.broadcast_to(base.astype(np.float32), (h, w, 3)).copy()
     if paint.texture > 0.0:
         if paint.style == "wallpaper":
-            tile = _noise(rng, 0.36, 0.36, 96, 96, OCTAVES_M[1:])
+            tile = _noise(fine, 0.36, 0.36, 96, 96, OCTAVES_M[1:])
             step = max(2, round(0.36 / paint.texel))
             tile = cv2.resize(tile, (step, step), interpolation=cv2.INTER_AREA)
             pattern = np.tile(tile, (h // step + 1, w // step + 1, 1))[:h, :w]
         else:
-            pattern = _noise(rng, *paint.size, w, h, OCTAVES_M)
+            pattern = _noise(fine, *paint.size, w, h, OCTAVES_M)
             if paint.style == "bricks":
                 pattern += _bricks(rng, paint, w, h)
             elif paint.style == "posters":
@@ -126,11 +127,11 @@ def _noise(
     """Value noise ``(h, w, 3)``, about -1 to 1; the grid of each octave does not depend on the resolution."""
     result = np.zeros((h, w, 3), dtype=np.float32)
     for octave in octaves:
+        if octave * w / width < 1.0:
+            break  # finer than the texels: would only alias
         columns, rows = int(width / octave) + 3, int(height / octave) + 3
         grey = rng.uniform(-1.0, 1.0, (rows, columns, 1))
         grid = (0.8 * grey + 0.2 * rng.uniform(-1.0, 1.0, (rows, columns, 3))).astype(np.float32)
-        if octave * w / width < 1.0:
-            continue  # finer than the texels: would only alias
         x = (np.arange(w, dtype=np.float32) + 0.5) * np.float32(width / w / octave)
         y = (np.arange(h, dtype=np.float32) + 0.5) * np.float32(height / h / octave)
         map_x, map_y = np.meshgrid(x, y)
