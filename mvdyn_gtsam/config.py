@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mvdyn_gtsam.config_tree import ConfigKey, build, describe_tree, parse_override, read_file, to_plain
 from mvdyn_gtsam.errors import ConfigError
@@ -52,6 +52,9 @@ class GraphConfig:
     """Visible share of the grid that a temporal edge beyond the last keyframe needs. Source: measured, fast
     hand-held motion (hololens_office_2seg): below it flow finds next to nothing, and the poses came out alike
     with 0, 0.2 and 0.4."""
+    inter_camera: bool = True
+    """Connect frames of different cameras; without, each video is tracked alone and cameras stay where the
+    start's poses hold them. Source: paper; false is its ablation "w/o ST-Graph"."""
     max_active_edges: int = 96
     """Inter-camera edges kept in the active window; the oldest go first. Source: paper supplement, edge
     ablation."""
@@ -95,6 +98,10 @@ class TrackingConfig:
     """Frames in the sliding window, per camera. Source: paper supplement, parameters."""
     free: int = 10
     """Latest frames of the window that are optimised. Source: paper supplement, parameters."""
+    depth_model: Literal["structureless", "fixed_shape", "carried_shape"] = "structureless"
+    """What poses are solved with: every grid point's depth, eliminated inside the factor; or only a scale of
+    the depth map, whose shape is solved anew between solves of the poses (fixed_shape) or stays as carried
+    over from the start (carried_shape). Source: DESIGN 5; the others are for experiments/ablations."""
     depth_prior_lambda: float = 0.005
     """Weight of the depth prior against the flow. Source: paper supplement, parameters (Eq. 4)."""
     grid_points: int = 768

@@ -1,4 +1,7 @@
-"""The structureless flow factor of a keyframe where some neighbours are known and not variables."""
+"""The flow factor of a keyframe where some neighbours are known and not variables.
+
+It is the structureless one, or, for a ``FixedShapeMeasurement``, the sum of pairwise ones.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from factors.keys import S, X
 from factors.measurement import StructurelessMeasurement
 from factors.structureless import evaluate, linearize
 from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.tracking.fixed_shape import FixedShapeMeasurement, evaluate_fixed, linearize_fixed
 
 Array = npt.NDArray[np.float64]
 
@@ -61,16 +65,33 @@ def _error(
     known = solved.get(state)
     if jacobians is None:
         if known is None:
-            known = solved[state] = evaluate(measure(), wTi, wTj, log_scale)
+            known = solved[state] = _evaluate(measure(), wTi, wTj, log_scale)
             if len(solved) > REMEMBERED:
                 solved.popitem(last=False)
         error = np.zeros(6 * len(wTj) + 2)
         error[-1] = np.sqrt(2.0 * known[0])
         return error
-    rows = linearize(measure(), wTi, wTj, log_scale, None if known is None else known[1])
+    rows = _linearize(measure(), wTi, wTj, log_scale, None if known is None else known[1])
     jacobians[0] = np.asfortranarray(rows[:, :6])
     for position, index in enumerate(free):
         jacobians[position + 1] = np.asfortranarray(rows[:, 6 * index + 6 : 6 * index + 12])
     jacobians[len(free) + 1] = np.asfortranarray(rows[:, -2:-1])
     error = np.ascontiguousarray(rows[:, -1])
     return error
+
+
+def _evaluate(
+    measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float
+) -> tuple[float, Array]:
+    """Cost and log depths."""
+    if isinstance(measurement, FixedShapeMeasurement):
+        return evaluate_fixed(measurement, wTi, wTj, log_scale), measurement.log_shape + log_scale
+    return evaluate(measurement, wTi, wTj, log_scale)
+
+
+def _linearize(
+    measurement: StructurelessMeasurement, wTi: Array, wTj: Array, log_scale: float, solved: Array | None
+) -> Array:
+    if isinstance(measurement, FixedShapeMeasurement):
+        return linearize_fixed(measurement, wTi, wTj, log_scale)
+    return linearize(measurement, wTi, wTj, log_scale, solved)

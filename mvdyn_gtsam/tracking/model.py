@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ from mvdyn_gtsam.frontend.dense_flow import GridFlow
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.geometry import pixel_rays
 from mvdyn_gtsam.graph.connections import EdgeCounts, EdgeKind, Frame
+from mvdyn_gtsam.tracking.fixed_shape import FixedShapeMeasurement
 
 Array = npt.NDArray[np.float64]
 
@@ -96,11 +98,15 @@ def measurement_of(
 
     ``thin`` takes every second grid point, as on a checkerboard; ``robust_px`` replaces the configured one.
     Robust scale and noise grow with the keyframe's own noise: blurred or fast frames are measured worse.
+    Where ``tracking.depth_model`` fixes the shape of depth, that shape comes along.
     """
     view = views[keyframe.camera]
     flows = [keyframe.flows[frame] for frame in neighbours]
     points = view.checkerboard if thin else slice(None)
-    return StructurelessMeasurement(
+    make: Callable[..., StructurelessMeasurement] = StructurelessMeasurement
+    if config.depth_model != "structureless":
+        make = partial(FixedShapeMeasurement, log_shape=_log_shape(keyframe, config)[points])
+    return make(
         rays=view.rays[points],
         initial_log_depth=keyframe.log_depth[points],
         prior_log_depth=keyframe.prior_log_depth[points],
@@ -112,6 +118,13 @@ def measurement_of(
         noise_px=keyframe.noise_ratio * config.noise_px,
         steps=steps,
     )
+
+
+def _log_shape(keyframe: Keyframe, config: TrackingConfig) -> Array:
+    """``(N,)`` log depth before the scale."""
+    if config.depth_model == "carried_shape":
+        return keyframe.prior_log_depth
+    return keyframe.log_depth - keyframe.log_scale
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ logger = logging.getLogger(__name__)
 def hold_mounts(state: TrackState) -> Mounts:
     """The mounts ``aTb`` that holding costs next to nothing; the keyframes are moved to where they hold."""
     keyframes, config = state.keyframes, state.tracking
+    if not state.graph_config.inter_camera:  # a mount would connect cameras
+        return {}
     likely = {
         pair: aTb
         for pair, aTb in likely_mounts({k.frame: k.wTc for k in keyframes}, state.rig_config).items()

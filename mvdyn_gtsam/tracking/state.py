@@ -110,6 +110,8 @@ class TrackState:
     def edges_to_other_cameras(self, keyframe: Keyframe, per_camera: int) -> list[Edge]:
         """New connections to keyframes of the other cameras of its group whose images can be had."""
         edges: list[Edge] = []
+        if not self.graph_config.inter_camera:
+            return edges
         for camera, track in enumerate(self.tracks):
             if camera == keyframe.camera or self.group_of[camera] != self.group_of[keyframe.camera]:
                 continue

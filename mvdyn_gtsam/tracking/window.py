@@ -146,7 +146,7 @@ def solve_depth(
 ) -> None:
     """Solve the keyframe's log depths at the current poses of ``frames``.
 
-    Nothing changes where it has no useful neighbour among ``frames``.
+    Nothing changes where it has no useful neighbour among ``frames``. A carried shape keeps its form.
     """
     neighbours = [frame for frame in useful_neighbours(keyframe) if frame in frames]
     if not neighbours:
@@ -156,6 +156,8 @@ def solve_depth(
     keyframe.log_depth, keyframe.information = solve_log_depths(
         measurement, keyframe.wTc, wTj, keyframe.log_scale
     )
+    if config.depth_model == "carried_shape":
+        keyframe.log_depth = keyframe.prior_log_depth + keyframe.log_scale
 
 
 def _make_isam() -> gtsam.ISAM2:
