@@ -60,7 +60,7 @@ def score_start(
             continue
         known = {camera: sorted(set(estimated[camera]) & set(truth[camera])) for camera in group}
         try:
-            scale = _scale(known, estimated, truth)
+            scale = metres_per_unit(known, estimated, truth)
         except EvaluationError as error:
             problems.append(f"{', '.join(group)}: {error}")
             continue
@@ -82,10 +82,13 @@ def score_start(
     )
 
 
-def _scale(
+def metres_per_unit(
     known: Mapping[str, Sequence[int]], estimated: Mapping[str, Frames], truth: Mapping[str, Frames]
 ) -> float:
-    """Metres per unit of the group's world, from one Sim(3) over all its frames."""
+    """Metres per unit of a group's world, from one Sim(3) over its frames ``known`` (camera -> numbers).
+
+    Raises EvaluationError where these define none.
+    """
     keys = [(camera, frame) for camera, frames in known.items() for frame in frames]
     if not keys:
         raise EvaluationError("no placed frame has a true pose")
