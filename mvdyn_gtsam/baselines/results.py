@@ -73,7 +73,7 @@ class Comparison:
     def to_table(self) -> Table:
         """The same for the terminal."""
         # Must fit 80 columns: headings break before their unit, figures never break, long names may.
-        table = Table(title=self.capture, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+        table = Table(title=self.capture, box=box.SIMPLE_HEAD, pad_edge=False, padding=0)
         columns = self._columns()
         for name in columns:
             heading = "\n".join(name.replace("inter-", "inter- ").split())
@@ -81,8 +81,9 @@ class Comparison:
             table.add_column(
                 heading, justify="left" if first else "right", no_wrap=not first, overflow="fold"
             )
-        for row in self._rows(columns):
-            table.add_row(*row)
+        for name, *figures in self._rows(columns):
+            long = len(name) > _NAME_WIDTH
+            table.add_row(name.replace("-", "-\n") if long else name, *figures)
         table.caption = "\n".join(self._notes()) or None
         table.caption_justify = "left"
         return table
@@ -107,6 +108,9 @@ class Comparison:
                 notes.append(f"{result.method}: no depth for {missing}.")
         return notes
 
+
+_NAME_WIDTH = 13
+"""What 80 columns leave for the name beside all figures."""
 
 _Figure = Callable[[MethodResult], float | None]
 
