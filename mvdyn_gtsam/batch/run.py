@@ -129,7 +129,7 @@ def _run(todo: Sequence[Clip], plan: Plan, settings: BatchSettings, table: _Tabl
     else:
         threads = settings.threads or max(1, processors // workers)
         plan = dataclasses.replace(plan, threads=threads)
-        logger.info("%s; %d at a time, %d threads each", kept, workers, threads)
+        logger.info("%s; clips at once: %d, threads of each: %d", kept, workers, threads)
         cluster = local_cluster(workers, settings.retries)
     with cluster as client:
         job = functools.partial(reconstruct_clip, plan=plan)

@@ -10,7 +10,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any
 
@@ -43,12 +43,25 @@ def require_dask() -> None:
 
 
 @contextmanager
+def _quiet() -> Iterator[None]:
+    """Dask tells of its inner workings; what matters of them is a row or a line of ours."""
+    dask_logger = logging.getLogger("distributed")
+    level = dask_logger.level
+    dask_logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        dask_logger.setLevel(level)
+
+
+@contextmanager
 def local_cluster(workers: int, retries: int) -> Iterator[Client]:
     """Processes on this machine; one that dies is replaced, and its clip run again ``retries`` times."""
     import dask
     from distributed import Client, LocalCluster
 
     with (
+        _quiet(),
         dask.config.set({"distributed.scheduler.allowed-failures": retries}),
         LocalCluster(
             n_workers=workers,
@@ -71,11 +84,14 @@ def remote_cluster(address: str) -> Iterator[Client]:
     """A running scheduler and its workers. Raises BatchError where there is none, or no worker."""
     from distributed import Client
 
-    try:
-        client = Client(address, timeout=CONNECT_S)
-    except (OSError, ValueError, TypeError) as error:
-        raise BatchError(f"{address}: no Dask scheduler answers there; start one: dask scheduler") from error
-    with client:
+    with ExitStack() as stack:
+        stack.enter_context(_quiet())
+        try:
+            client = stack.enter_context(Client(address, timeout=CONNECT_S))
+        except (OSError, ValueError) as error:
+            raise BatchError(
+                f"{address}: no Dask scheduler answers there; start one: dask scheduler"
+            ) from error
         try:
             client.wait_for_workers(1, timeout=FIRST_WORKER_S)
         except TimeoutError as error:
