@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from experiments import paper
 from experiments.ablations.studies import NOISE_DEG, NOISE_LEVELS_M, STUDIES, Variant
-from experiments.records import Records
+from experiments.records import Records, key_of
+from mvdyn_gtsam.config import load_config, to_dict
+from mvdyn_gtsam.errors import ConfigError
 
 if TYPE_CHECKING:
     Entry = Mapping[str, Any]
@@ -42,8 +45,8 @@ class Kept:
     """(capture, method, stage) -> entry"""
     phases: Mapping[tuple[str, str], Entry]
     """(capture, variant) -> entry"""
-    ablations: Mapping[tuple[str, tuple[str, ...], str], Entry]
-    """(capture, settings, start) -> entry"""
+    ablations: Mapping[tuple[str, str, str], Entry]
+    """(capture, digest of all settings, start) -> entry"""
 
     @staticmethod
     def read(folder: Path) -> Kept:
@@ -55,7 +58,11 @@ class Kept:
         return Kept(
             {(e["capture"], e["method"].lower(), e["stage"]): e for e in accuracy if not e.get("overrides")},
             {(e["capture"], e["variant"]): e for e in phases if not e["overrides"]},
-            {(e["capture"], tuple(e["settings"]), e["start"]): e for e in ablations},
+            {
+                (e["capture"], digest, e["start"]): e
+                for e in ablations
+                if (digest := _settings_digest(tuple(e["settings"]))) is not None
+            },
         )
 
     @property
@@ -87,7 +94,22 @@ class Kept:
 
     def variant(self, capture: str, variant: Variant) -> Entry | None:
         """Entry of a variant of the ablations."""
-        return self.ablations.get((capture, variant.settings, variant.start.describe()))
+        digest = _settings_digest(variant.settings)
+        return None if digest is None else self.ablations.get((capture, digest, variant.start.describe()))
+
+
+@cache
+def _settings_digest(overrides: tuple[str, ...]) -> str | None:
+    """Of every setting that tracking has with ``overrides``; None where a setting is no longer known.
+
+    Variants that come to the same are run once, under the name of the first of them.
+    """
+    try:
+        settings = to_dict(load_config(None, overrides))
+    except ConfigError:
+        return None
+    del settings["refinement"]
+    return key_of(settings=settings)
 
 
 def scene_of(capture: str) -> str | None:
@@ -219,16 +241,15 @@ def _effect_row(
 def effects(kept: Kept) -> list[Effect]:
     """Every ablation of the paper."""
     found = []
-    for study, source, printed in (
-        ("without_init", "Ablation studies on camera pose tracking", paper.WITHOUT_START),
-        ("without_st_graph", "Ablation studies on camera pose tracking", paper.WITHOUT_ST_GRAPH),
-    ):
-        full = STUDIES[study].variants[0]
-        for variant in STUDIES[study].variants:
-            if variant.hurts:
-                pairs = {c: (kept.variant(c, full), kept.variant(c, variant)) for c in kept.captures}
-                name = f"{STUDIES[study].title}: {variant.name}"
-                found.append(effect(name, source, printed, paper.TRAJECTORY_KEYS, pairs))
+    for study in STUDIES.values():
+        for variant in study.variants:
+            if variant.reported is None:
+                continue
+            full = next((v for v in study.variants if v.name == variant.against), study.variants[0])
+            pairs = {c: (kept.variant(c, full), kept.variant(c, variant)) for c in kept.captures}
+            name = f"{study.title}: {variant.name}" + (f" against {full.name}" if variant.against else "")
+            source = "Ablation studies on camera pose tracking"
+            found.append(effect(name, source, variant.reported, paper.TRAJECTORY_KEYS, pairs))
     return [*found, *_noise_effects(kept), *_edge_effects(kept), *_refinement_effects(kept)]
 
 

@@ -12,7 +12,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -189,7 +189,8 @@ def markdown_table(timings: list[Timing], points: int, edges: int) -> str:
     return "\n".join(lines)
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Time, print the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -199,12 +200,15 @@ def main() -> int:
     )
     parser.add_argument("--repeats", type=int, default=50, help="timed runs of each row (default: 50)")
     parser.add_argument("--seed", type=int, default=0, help="of the random scene (default: 0)")
-    arguments = parser.parse_args()
-    if min(arguments.points, arguments.repeats, *arguments.edges) < 1:
+    parser.add_argument("--quick", action="store_true", help="a few points and runs: whether it works at all")
+    options = parser.parse_args(arguments)
+    if options.quick:
+        options.points, options.edges, options.repeats = 48, [2], RUNS_PER_BLOCK
+    if min(options.points, options.repeats, *options.edges) < 1:
         parser.error("--points, --edges and --repeats must be at least 1")
-    for edges in arguments.edges:
-        timings = run(arguments.points, edges, arguments.repeats, arguments.seed)
-        sys.stdout.write(markdown_table(timings, arguments.points, edges) + "\n\n")
+    for edges in options.edges:
+        timings = run(options.points, edges, options.repeats, options.seed)
+        sys.stdout.write(markdown_table(timings, options.points, edges) + "\n\n")
     return 0
 
 

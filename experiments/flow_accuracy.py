@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from experiments.records import QUICK, quick_scene
 from mvdyn_gtsam.capture.loader import load_capture
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.evaluation.groundtruth import GroundTruth, load_groundtruth
@@ -292,7 +293,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("captures", nargs="+", type=Path, help="rendered captures with groundtruth/depth")
+    parser.add_argument("captures", nargs="*", type=Path, help="rendered captures with groundtruth/depth")
+    parser.add_argument("--quick", action="store_true", help="a tiny generated scene, kept in out/quick")
     parser.add_argument("--sweep", choices=sorted(sweeps()), default="default")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--times", type=int, default=3, help="source frames per camera")
@@ -301,9 +303,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--by", choices=["kind", "scene"], default="kind")
     parser.add_argument("--out", type=Path, help="append the table to this Markdown file")
     options = parser.parse_args(arguments)
+    if options.quick == bool(options.captures):
+        parser.error("name captures or give --quick")
+    captures = (
+        [quick_scene(options.out.parent if options.out else QUICK)] if options.quick else options.captures
+    )
     variants = sweeps()[options.sweep]
     results: dict[str, list[tuple[Case, Score]]] = {variant.name: [] for variant in variants}
-    for folder in options.captures:
+    for folder in captures:
         for case in load_cases(folder, options.times, options.condition, options.kinds):
             light = replace(case, **{f.name: None for f in fields(Case) if f.name not in ("scene", "kind")})  # type: ignore[arg-type]
             for variant in variants:

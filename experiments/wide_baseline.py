@@ -25,15 +25,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from experiments.plots import bars
 from experiments.records import (
     ExperimentError,
     Page,
     Run,
-    add_common_arguments,
-    captures_or_rendered,
+    captures_of,
+    experiment_parser,
     figure,
     finite,
     key_of,
+    parse,
     run_experiment,
     table,
 )
@@ -43,6 +45,8 @@ from mvdyn_gtsam.config import Config, load_config, to_dict
 from mvdyn_gtsam.errors import BaselineError
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from mvdyn_gtsam.frontend.start import Start
 
 Placed = tuple[list[list[str]], Mapping[str, Frames], float]
@@ -193,13 +197,17 @@ def measure(folder: Path, variant: Variant, work: Path | None = None) -> dict[st
     }
 
 
+def worst(key: str, entry: Mapping[str, Any]) -> float | None:
+    """That error of the worst pair of cameras; None where no pair was placed."""
+    return max((float(pair[key]) for pair in entry["pairs"]), default=None)
+
+
 def summary_rows(entries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """One row per run: the worst pair of cameras of each."""
     rows = []
     for entry in entries:
-        pairs, depth = entry["pairs"], entry["median_depth_m"]
-        rotation = max((pair["rotation_deg"] for pair in pairs), default=None)
-        translation = max((pair["translation_m"] for pair in pairs), default=None)
+        depth = entry["median_depth_m"]
+        rotation, translation = worst("rotation_deg", entry), worst("translation_m", entry)
         rows.append(
             [
                 entry["capture"],
@@ -276,14 +284,16 @@ def render(entries: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join([*parts, *(["".join(problems)] if problems else [])])
 
 
+def draw(picture: Figure, entries: Sequence[Mapping[str, Any]]) -> None:
+    """Errors of the worst pair of cameras of every start; a cross where none was placed."""
+    left, right = picture.subplots(1, 2)
+    bars(left, entries, "capture", "variant", partial(worst, "rotation_deg"), "worst pair (deg)")
+    bars(right, entries, "capture", "variant", partial(worst, "translation_m"), "worst pair (m)")
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    result = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    result.add_argument("captures", nargs="*", type=Path, help="default: all of ../shared/data/rendered")
-    result.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
-                        help="change a setting, e.g. frontend.wide_baseline.ratio=0.7")  # fmt: skip
+    result = experiment_parser(NAME, __doc__)
     result.add_argument("--sweep", dest="sweeps", action="append", default=[], metavar="KEY=V1,V2,...",
                         help="repeat with each value; several sweeps: one at a time")  # fmt: skip
     result.add_argument("--kept", type=Path, metavar="WORK",
@@ -292,17 +302,16 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument("--joint-frames", type=int, default=8, metavar="N",
                         help="frames per camera for --joint-sfm (default: %(default)s)")  # fmt: skip
     result.add_argument("--name", help="of the Markdown file (default: wide_baseline, or after the sweep)")
-    add_common_arguments(result)
     return result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, print the tables, write them."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    options = parser().parse_args(words)
+    options = parse(parser(), words)
 
     def plan() -> list[Run]:
-        captures = captures_or_rendered(options.captures)
+        captures = captures_of(options)
         wanted = variants(options.overrides, options.sweeps, options.joint_frames if options.joint_sfm else 0)
         return [
             Run(
@@ -318,7 +327,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     swept = "_".join(sweep.partition("=")[0].rsplit(".", 1)[-1] for sweep in options.sweeps)
     path = options.results / f"{options.name or '_'.join(filter(None, [NAME, swept]))}.md"
-    pages = [Page(path, "The wide-baseline start alone", render)]
+    pages = [Page(path, "The wide-baseline start alone", render, draw)]
     return run_experiment(NAME, words, options.results / f"{NAME}.json", pages, plan)
 
 

@@ -13,6 +13,7 @@ from experiments import paper, summary
 from experiments.ablations.studies import STUDIES
 from experiments.against_paper import Kept, direction, effects, method_rows
 from experiments.records import RESULTS, Records
+from mvdyn_gtsam.config import load_config
 
 SCORES = {"registered": 1.0, "ate_m": 0.002, "rte_m": 0.001, "rre_deg": 0.01, "groups": []}
 SCORES |= {"abs_rel": 0.05, "delta_1_25": 0.95, "m_d": 0.04, "m_d_scale_only": 0.03}
@@ -87,6 +88,17 @@ def test_a_variant_that_fails_is_worse_and_a_failing_reference_says_nothing(tmp_
     add_variant(tmp_path, "without_init", "full method", problem="lost")
     row = effect_rows(tmp_path, "Without the wide-baseline start: nothing")["dynamic_human", "ate_m"]
     assert row.agrees is None
+
+
+def test_a_run_is_found_under_whatever_name_it_was_made(tmp_path: Path) -> None:
+    """A setting at its default is the full method; one that no longer exists is nobody's."""
+    default = f"graph.st_per_frame={load_config(None, []).graph.st_per_frame}"
+    start = STUDIES["without_init"].variants[0].start.describe()
+    for key, setting, error in (("a", default, 0.007), ("b", "graph.gone=1", 0.5)):
+        entry = {"capture": "roboarm", "settings": [setting], "problem": None, "start": start}
+        Records(tmp_path / "ablations.json").add(key, {**entry, "scores": {**SCORES, "ate_m": error}})
+    found = Kept.read(tmp_path).variant("roboarm", STUDIES["without_init"].variants[0])
+    assert found is not None and found["scores"]["ate_m"] == 0.007
 
 
 def test_noise_is_the_median_of_its_seeds(tmp_path: Path) -> None:

@@ -1,0 +1,107 @@
+"""Every experiment of ours from end to end on the tiny generated scene, with `--quick`.
+
+The ablations and the table of methods have such tests of their own.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from experiments import (
+    factor_cost,
+    flow_accuracy,
+    refinement_phases,
+    refinement_pictures,
+    scaling,
+    summary,
+    tracking_sweep,
+    wide_baseline,
+)
+
+needs_scenes = pytest.mark.skipif(
+    importlib.util.find_spec("embreex") is None, reason="needs embreex: pip install mvdyn_gtsam[scenes]"
+)
+pytestmark = [pytest.mark.slow, needs_scenes]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One folder for all, so that the scene is made once."""
+    return tmp_path_factory.mktemp("quick")
+
+
+def runs(results: Path, name: str) -> list[dict[str, Any]]:
+    return list(json.loads((results / f"{name}.json").read_text())["runs"])
+
+
+def is_whole(results: Path, name: str) -> None:
+    """A page with figures, and its plot."""
+    text = (results / f"{name}.md").read_text()
+    assert f"({name}.png)" in text and text.count("\n| ") >= 3
+    assert (results / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_refinement_phases_pictures_of_what_they_leave_and_the_summary(results: Path) -> None:
+    words = ["--quick", "--results", str(results), "--variants", "tracking", "phases 1, 2"]
+    assert refinement_phases.main(words) == 0
+    tracked, refined = (entry["scores"] for entry in runs(results, "refinement_phases"))
+    assert tracked["registered"] == refined["registered"] == 1.0
+    assert refined["abs_rel"] < tracked["abs_rel"] and refined["m_d"] < tracked["m_d"]
+    is_whole(results, "refinement_phases")
+    is_whole(results, "refinement_on_tracking")
+
+    assert refinement_pictures.main(["--quick", "--out", str(results)]) == 0
+    for kind in ("depth", "points"):
+        assert (results / f"{kind}_quick_2x14.jpg").read_bytes().startswith(b"\xff\xd8")
+    assert summary.main(["--quick", "--results", str(results)]) == 0
+    assert "| none, quick_2x14 | ours (refined) | - | - | - | 100.0 |" in (results / "summary.md").read_text()
+
+
+def test_scaling(results: Path) -> None:
+    words = ["--quick", "--results", str(results), "--frames", "10", "--cameras", "2"]
+    assert scaling.main(words) == 0
+    for entry in runs(results, "scaling"):
+        assert entry["problem"] is None and entry["scores"]["registered"] == 1.0
+        assert entry["peak_mb"] > entry["libraries_mb"] > 0.0
+        assert set(entry["phase_seconds"]) == {"start", "tracking"}
+    is_whole(results, "scaling_frames")
+    is_whole(results, "scaling_cameras")
+
+
+def test_wide_baseline(results: Path) -> None:
+    assert wide_baseline.main(["--quick", "--results", str(results)]) == 0
+    [entry] = runs(results, "wide_baseline")
+    assert entry["problem"] is None and entry["pairs"]
+    is_whole(results, "wide_baseline")
+
+
+def test_tracking_sweep(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--quick", "--start-folder", str(results), "--vary", "tracking.robust_px=1.0"]
+    assert tracking_sweep.main(words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(" | ")[1] for line in lines[1:]] == ["defaults", "tracking.robust_px=1.0"]
+
+
+def test_flow_accuracy(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [
+        "--quick",
+        "--kinds",
+        "+1",
+        "cross+0",
+        "--times",
+        "1",
+        "--out",
+        str(results / "flow_accuracy.md"),
+    ]
+    assert flow_accuracy.main(words) == 0
+    assert "| default | cross+0 |" in capsys.readouterr().out
+
+
+def test_factor_cost(capsys: pytest.CaptureFixture[str]) -> None:
+    assert factor_cost.main(["--quick"]) == 0
+    assert "N = 48 points, E = 2 edges" in capsys.readouterr().out
