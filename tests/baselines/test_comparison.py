@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -162,10 +163,16 @@ def test_a_camera_without_any_pose_is_incomplete_and_not_an_error(
     assert result.problem is None and result.registered == 0.5
 
 
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
+    folder = tmp_path_factory.mktemp("rendered") / "clip"
+    return folder, write_capture(folder, frames=6)
+
+
 @pytest.fixture
-def clip(tmp_path: Path) -> tuple[Path, dict[str, np.ndarray]]:
+def clip(rendered: tuple[Path, dict[str, np.ndarray]], tmp_path: Path) -> tuple[Path, dict[str, np.ndarray]]:
     """A capture that can be opened, of six frames, with true poses."""
-    return tmp_path / "clip", write_capture(tmp_path / "clip", frames=6)
+    return shutil.copytree(rendered[0], tmp_path / "clip"), rendered[1]
 
 
 def never(*_: object) -> ProcessUsage:

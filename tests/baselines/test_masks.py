@@ -17,10 +17,11 @@ from tests.baselines.scenes import HEIGHT, WIDTH, write_capture
 FRAMES = 6
 
 
-@pytest.fixture
-def capture(tmp_path: Path) -> Capture:
-    write_capture(tmp_path / "clip", frames=FRAMES, cameras=1)
-    return load_capture(tmp_path / "clip")
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    folder = tmp_path_factory.mktemp("masks") / "clip"
+    write_capture(folder, frames=FRAMES, cameras=1)
+    return load_capture(folder)
 
 
 def write(folder: Path, times: range, value: int = 255) -> Path:

@@ -23,6 +23,7 @@ from mvdyn_gtsam.geometry import invert_pose, project, transform_points
 from mvdyn_gtsam.reconstruction import Reconstruction
 from mvdyn_gtsam.reconstruction.export import export_colmap, export_nerfstudio, export_tum
 from mvdyn_gtsam.reconstruction.imports import ImportedResult, load_result
+from mvdyn_gtsam.reconstruction.imports.load import find_layout
 from tests.reconstruction.test_export import CAMERAS, FRAMES, capture, make, random_pose, world_points
 
 PIXELS = np.array([[3, 5], [20, 17], [31, 23]])
@@ -112,6 +113,19 @@ def test_intrinsics_of_another_resolution_are_brought_to_that_of_the_frames(tmp_
         )
     (model / "cameras.txt").write_text("\n".join(lines) + "\n")
     assert_same_scene(load_result(tmp_path / "colmap", capture()), known)
+
+
+def test_the_models_of_a_colmap_project_are_found(tmp_path: Path) -> None:
+    for name in ("0", "1"):
+        (tmp_path / "sparse" / name).mkdir(parents=True)
+        for file in ("cameras.bin", "images.bin"):
+            (tmp_path / "sparse" / "0" / file).touch()
+    for path in (tmp_path, tmp_path / "sparse", tmp_path / "sparse" / "0"):
+        assert find_layout(path, capture()) == ("colmap", tmp_path / "sparse" / "0")
+    for file in ("cameras.txt", "images.txt"):
+        (tmp_path / "sparse" / "1" / file).touch()
+    with pytest.raises(ResultError, match="several results .sparse/0, sparse/1.; give the path of one"):
+        load_result(tmp_path, capture())
 
 
 def test_colmap_images_that_are_missing_are_frames_without_a_pose(tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def test_no_depth_is_made_up_between_near_and_far(tmp_path: Path) -> None:
 def test_depth_lies_beside_sparse_of_a_colmap_project(tmp_path: Path) -> None:
     (model,) = export_colmap(make(tmp_path / "ours"), tmp_path / "project")
     write_depth(tmp_path / "project" / "depth" / "cam0" / "0.npy", sample())
-    for path in (tmp_path / "project", tmp_path / "project" / "sparse", model):
+    for path in (tmp_path / "project", model):
         np.testing.assert_array_equal(load_result(path, capture()).depth("cam0", 0), expected())
 
 
