@@ -18,6 +18,7 @@ from mvdyn_gtsam.batch.job import Plan, described, is_finished, needs_scores, re
 from mvdyn_gtsam.batch.report import BatchReport, Row, State, read_rows
 from mvdyn_gtsam.batch.scheduling import local_cluster, remote_cluster, require_dask, run_clips
 from mvdyn_gtsam.config import Config, to_dict
+from mvdyn_gtsam.errors import MvdynError
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction.files import write_atomically, write_json
 from mvdyn_gtsam.refinement.pool import worker_count
@@ -138,15 +139,24 @@ def _run(todo: Sequence[Clip], plan: Plan, settings: BatchSettings, table: _Tabl
 
 def _known(clip: Clip, plan: Plan, earlier: Row | None) -> Row:
     """What can be said of ``clip`` before anything runs."""
-    if is_finished(clip, plan):
-        row = described(clip, plan, State.KEPT)
-        if earlier is not None:
-            figures = ("seconds", "peak_mb", "ate_m", "abs_rel")
-            row = dataclasses.replace(row, **{name: getattr(earlier, name) for name in figures})
-        return row
-    if earlier is not None and earlier.state is State.FAILED:
-        return earlier
-    return Row(clip.name, State.UNFINISHED)
+    try:
+        kept = described(clip, plan, State.KEPT) if is_finished(clip, plan) else None
+    except MvdynError as error:  # its own run will say so, too; it must not stop the others
+        logger.warning("%s", error)
+        kept = None
+    if kept is None:
+        if earlier is not None and earlier.state is State.FAILED:
+            return earlier
+        return Row(clip.name, State.UNFINISHED)
+    if earlier is None:
+        return kept
+    return dataclasses.replace(
+        kept,
+        seconds=earlier.seconds,
+        peak_mb=earlier.peak_mb,
+        ate_m=earlier.ate_m,
+        abs_rel=earlier.abs_rel,
+    )
 
 
 def _is_left(clip: Clip, plan: Plan, row: Row, settings: BatchSettings) -> bool:

@@ -94,7 +94,7 @@ def test_failures_stop_nobody_and_a_second_run_does_only_what_is_left(
     }
     folder, out = write_captures(tmp_path / "clips", tasks), tmp_path / "out"
     write_groundtruth(folder / "good", {f"cam{n}": true_poses(n, 4) for n in range(2)})
-    settings = dataclasses.replace(settings, retries=1, timeout_s=3.0)
+    settings = dataclasses.replace(settings, retries=1, timeout_s=6.0)
     report = run_batch(folder, out, settings=settings)
     rows = {row.clip: row for row in report.rows}
     assert states(report) == {
@@ -102,7 +102,7 @@ def test_failures_stop_nobody_and_a_second_run_does_only_what_is_left(
     }  # fmt: skip
     assert rows["bad"].problem == "mvdyn: cam0.mp4: cut short (exit code 1)"
     assert "killed by SIGKILL" in str(rows["crash"].problem)
-    assert rows["late"].problem == "stopped after 3 s"
+    assert rows["late"].problem == "stopped after 6 s"
     assert trace(out, "crash") == ["start", "start"] and trace(out, "late") == ["start"]
     good = rows["good"]
     assert (good.cameras, good.frames, good.registered) == (2, 4, 1.0)
@@ -160,6 +160,15 @@ def test_a_result_of_another_configuration_is_not_taken_for_finished(
     other = load_config(None, ["tracking.window=20"])
     report = run_batch(folder, out, other, settings)
     assert states(report) == {"clip": "failed"} and "another configuration" in str(report.rows[0].problem)
+
+
+def test_a_damaged_result_stops_no_other_clip(tmp_path: Path, settings: BatchSettings) -> None:
+    folder, out = write_captures(tmp_path / "clips", {"damaged": {}, "whole": {}}), tmp_path / "out"
+    (out / "damaged").mkdir(parents=True)
+    (out / "damaged" / "manifest.json").write_text('{"format": "mvdyn-reconstruction"')
+    report = run_batch(folder, out, settings=settings)
+    assert states(report) == {"damaged": "failed", "whole": "done"}
+    assert "damaged/manifest.json: cannot be read" in str(report.rows[0].problem)
 
 
 def test_a_folder_that_cannot_be_used_is_refused(tmp_path: Path) -> None:
