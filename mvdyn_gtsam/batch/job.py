@@ -115,7 +115,14 @@ def described(clip: Clip, plan: Plan, state: State) -> Row:
     result = Reconstruction.load(plan.result(clip))
     poses = np.concatenate([result.trajectory(camera)[1] for camera in result.cameras])
     registered = float(np.isfinite(poses).all(axis=(1, 2)).mean())
-    return Row(clip.name, state, len(result.cameras), result.frame_count, registered)
+    return Row(
+        clip.name,
+        state,
+        len(result.cameras),
+        result.frame_count,
+        registered,
+        groups=len(result.groups),
+    )
 
 
 def one_line(error: BaseException) -> str:

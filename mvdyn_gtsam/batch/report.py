@@ -48,6 +48,8 @@ class Row:
     """Peak resident memory of the largest single process, MiB."""
     ate_m: float | None = None
     abs_rel: float | None = None
+    groups: int | None = None
+    """World frames; more than one where no view connects all cameras."""
     problem: str | None = None
     """One line: why it failed, or why it has no scores."""
 
@@ -93,6 +95,9 @@ class BatchReport:
         notes = [f"{row.clip}: {row.problem}" for row in self.rows if row.problem is not None]
         if any(row.state is State.RESUMED for row in self.rows):
             notes.append("resumed: seconds and memory are those of the last process only.")
+        apart = [row.clip for row in self.rows if row.groups is not None and row.groups > 1]
+        if apart:
+            notes.append(f"no view connects all cameras of {', '.join(apart)}: no common frame, large ATE.")
         if any(row.registered is not None and row.registered < 1.0 for row in self.rows):
             notes.append("poses below 100 %: the errors leave out the frames without a pose.")
         return notes

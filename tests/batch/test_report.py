@@ -14,7 +14,7 @@ REPORT = BatchReport(
     "tracking",
     (
         Row("clip1", State.DONE, 2, 41, 1.0, 33.26, 512.4, 0.00281, 0.0312),
-        Row("clip2", State.RESUMED, 3, 60, 0.95, 12.0, 400.0),
+        Row("clip2", State.RESUMED, 3, 60, 0.95, 12.0, 400.0, groups=2),
         Row("clip3", State.FAILED, seconds=1.0, problem="cam0.mp4: the file is empty"),
         Row("clip4", State.UNFINISHED),
     ),
@@ -27,9 +27,10 @@ def test_the_table_holds_every_clip_and_says_what_is_missing() -> None:
     assert "| clip2 | resumed | 3 x 60 | 95.0 | 12.0 | 400 | - | - |" in lines
     assert "| clip3 | failed | - | - | 1.0 | - | - | - |" in lines
     assert "| clip4 | unfinished | - | - | - | - | - | - |" in lines
-    assert lines[-3:] == [
+    assert lines[-4:] == [
         "* clip3: cam0.mp4: the file is empty",
         "* resumed: seconds and memory are those of the last process only.",
+        "* no view connects all cameras of clip2: no common frame, large ATE.",
         "* poses below 100 %: the errors leave out the frames without a pose.",
     ]
     assert [row.clip for row in REPORT.failed] == ["clip3"]
