@@ -18,7 +18,8 @@ from experiments.ablations.studies import FULL, Study, Variant
 from experiments.records import ExperimentError, experiment_parser, parse
 
 NAME = "tracking_sweep"
-QUICK = ("tracking.robust_px=0.5",)
+QUICK = ("tracking.grid_points=192",)
+"""A run that the ablation of the grid has, too."""
 
 
 def parser() -> argparse.ArgumentParser:

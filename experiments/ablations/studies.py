@@ -104,7 +104,7 @@ STUDIES = {
                 Variant("own maps", PRIOR_OFF, StartChange(StartKind.SAME_POSE), paper.WITHOUT_START),
                 Variant("nothing", PRIOR_OFF, StartChange(StartKind.FLAT), paper.WITHOUT_START),
             ),
-            quick=("full method", "own maps", "nothing"),
+            quick=("full method", "own maps"),
         ),
         Study(
             "without_st_graph",

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments import tracking_sweep
 from experiments.ablations import __main__ as ablations
 from experiments.ablations import measure as measuring
 from experiments.ablations import pages, starts
@@ -331,3 +332,31 @@ def test_shortened_studies_drop_what_is_not_run() -> None:
     short = study.shortened()
     assert 1 < len(short.variants) < len(study.variants)
     assert replace(study, quick=()).shortened().variants == study.variants
+
+
+# ---- the sweep -----------------------------------------------------------------------------------------
+
+
+def test_a_sweep_varies_each_setting_alone() -> None:
+    variants = tracking_sweep.study_of(["tracking.window=20, 30", "tracking.free=5"]).variants
+    assert [variant.settings for variant in variants] == [
+        (),
+        ("tracking.window=20",),
+        ("tracking.window=30",),
+        ("tracking.free=5",),
+    ]
+    assert measuring.run_key(Path("clip"), variants[0], []) == measuring.run_key(Path("clip"), FULL, [])
+
+
+@pytest.mark.parametrize("words", [[], ["--vary", "tracking.window"], ["--vary", "tracking.window=1,,2"]])
+def test_a_sweep_of_nothing_is_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert tracking_sweep.main(words) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "--vary" in error
+
+
+@pytest.mark.slow
+def test_quick_runs_the_sweep(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert tracking_sweep.main(["--quick", "--results", str(results)]) == 0
+    page = (results / "tracking_sweep.md").read_text()
+    assert "| full method |" in page and "| tracking.grid_points=192 |" in page and "(failed)" not in page
