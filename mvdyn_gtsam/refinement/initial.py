@@ -75,7 +75,7 @@ def static_residual(inverse_depth: Float32, edges: Sequence[Edge]) -> Float32:
 def failing_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[np.uint8]:
     """``(h, w)`` 1 in the regions where the static model fails; ``residual (h, w)`` px, NaN: unknown."""
     fails = cv2.medianBlur((np.nan_to_num(residual) > config.moving_px).astype(np.uint8), 5)
-    labels = _regions(_closed(fails, config), config)
+    labels = regions(_closed(fails, config), config)
     strong = np.nan_to_num(residual) > 2.0 * config.moving_px
     result = np.zeros(residual.shape, np.uint8)
     for label in range(1, labels.max() + 1):
@@ -104,7 +104,7 @@ def moving_regions(
         votes[edge.pixels[seen]] += fails.ravel()[edge.nearest[seen]]
         count[edge.pixels[seen]] += 1.0
     moves = (votes >= config.moving_share * count).astype(np.uint8).reshape(own.shape)
-    return _regions(_closed(cv2.medianBlur(moves, 5), config), config)
+    return regions(_closed(cv2.medianBlur(moves, 5), config), config)
 
 
 def _closed(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArray[np.uint8]:
@@ -114,7 +114,7 @@ def _closed(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArra
     return np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel), np.uint8)
 
 
-def _regions(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArray[np.int32]:
+def regions(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArray[np.int32]:
     """Connected parts of ``mask (h, w)``, numbered from 1; specks are left out."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     result = np.zeros(mask.shape, np.int32)

@@ -9,6 +9,50 @@ from mvdyn_gtsam.frontend.plane_sweep import SweepConfig
 
 
 @dataclass(frozen=True)
+class PlainConfig:
+    """Depth of regions without texture, from planes on which the rims of many frames agree. Choices marked
+    "compared" were tried beside others on robodog_overlap, three_cameras, dynamic_human and roboarm; no sweep
+    of them is kept. Lengths in px are of the view that is solved."""
+
+    fill: bool = True
+    """Whether it is done. Source: choice; for the ablation."""
+    contrast: float = 1.25
+    """Grey levels per px from which an image has texture. Source: compared, 1 to 1.5; more joins walls that
+    meet in the dark."""
+    smallest: float = 0.003
+    """Smallest region, as a share of the image. Source: choice."""
+    rim: int = 3
+    """Width of the rim, px. Source: compared, 2 and 3; a wide one is mostly of the neighbouring surface."""
+    tolerance: float = 0.03
+    """Relative error of inverse depth up to which a point lies on a plane. Source: compared, 0.02 to 0.05."""
+    rim_share: float = 0.35
+    """Share of its rim that a region's plane must fit. Source: compared, 0.25 to 0.65."""
+    spread: float = 0.015
+    """How far the points of a plane must be from lying on one line, focal lengths. Source: compared, 0.005 to
+    0.03."""
+    agreement: float = 0.05
+    """Mean relative difference of depth up to which two planes are alike on a region. Source: compared, 0.03
+    and 0.05."""
+    reach: float = 0.7
+    """A region lies no nearer than this share of its rim's nearest depth, nor farther than the farthest over
+    it. Source: compared, 0.3 to 0.7."""
+    window: int = 24
+    """Time steps before and after whose planes are asked. Source: compared, 12 to all; bounds the time."""
+
+    def __post_init__(self) -> None:
+        if self.rim < 1 or self.window < 0:
+            raise ConfigError(
+                f"refinement.plain.rim is {self.rim} and refinement.plain.window {self.window}; they must be"
+                " at least 1 and 0"
+            )
+        for name in ("contrast", "tolerance", "agreement"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"refinement.plain.{name} is {getattr(self, name)}; it must be above 0")
+        if not 0.0 < self.reach <= 1.0:
+            raise ConfigError(f"refinement.plain.reach is {self.reach}; it must be above 0 and at most 1")
+
+
+@dataclass(frozen=True)
 class RefinementConfig:
     """Stage 2: dense per-pixel refinement. Lengths in px are of the input resolution."""
 
@@ -84,12 +128,21 @@ class RefinementConfig:
     """Gaps in a moving region up to this share of the image's width are closed. Source: choice."""
     moving_share: float = 0.4
     """Share of the frames around that must see the static model fail. Source: choice."""
+    moving_reach: float = 0.06
+    """How far outside such a region its outline is looked for, as a share of the image's width. Source:
+    compared on three_cameras and dynamic_human, 0.02 to 0.1; no sweep is kept."""
+    moving_contrast: float = 11.0
+    """Grey levels by which a moving pixel differs from what stands behind it. Source: compared there, 4 to
+    12: above noise and what an error of pose or depth makes of texture."""
+    background_offsets: tuple[int, ...] = (8, 12, 16, 24, 32, 40)
+    """Distances in frames, both ways, at which what stands behind is looked for. Source: choice."""
     moving_agreement: float = 0.2
     """Share of a moving region whose depth from the same instant must agree before it is believed. Source:
     choice."""
     moving_sigma: float = 0.05
     """Standard deviation of that depth, relative. Source: choice."""
     sweep: SweepConfig = field(default_factory=SweepConfig)
+    plain: PlainConfig = field(default_factory=PlainConfig)
 
     def __post_init__(self) -> None:
         for name, low in (

@@ -24,7 +24,7 @@ from mvdyn_gtsam.refinement.poses import solve_poses
 from mvdyn_gtsam.refinement.samples import FrameSample, SampleStore
 from mvdyn_gtsam.refinement.scale import solve_scales
 from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.tasks import FIRST_DEPTH, GUIDE_STEPS, Context, FinishedFrame, windows
+from mvdyn_gtsam.refinement.tasks import FIRST_DEPTH, GUIDE_STEPS, PLANES, Context, FinishedFrame, windows
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
@@ -135,6 +135,8 @@ class Refinement:
                 for number in range(1, config.rounds + 1):
                     self._step(f"poses {number}", self._solve_poses)
                     self._solve_depth(f"depth {number}", config.depth_iterations)
+                if config.plain.fill:
+                    self._fill_plain("filled")
         scales = self._workspace.read_array("scales")
         return Refined(self._context.poses(), scales[0], scales[1], self.seconds)
 
@@ -218,6 +220,23 @@ class Refinement:
             self._map("window", jobs, label=target)
 
         self._step(target, solve)
+        self._depth = target
+
+    def _fill_plain(self, target: str) -> None:
+        """Planes for the regions without texture, agreed between frames."""
+        source = self._depth
+
+        def fill() -> None:
+            planes = self._pool.map("planes", [(source, frame) for frame in self._frames])
+            rows = [
+                np.insert(np.asarray(found), 0, np.array([frame]).T, axis=1)
+                for frame, found in zip(self._frames, planes, strict=True)
+            ]
+            self._workspace.write_array(PLANES, np.concatenate(rows))
+            self._workspace.create(target)
+            self._map("plain regions", [(source, target, frame) for frame in self._frames])
+
+        self._step("plain regions", fill)
         self._depth = target
 
     def _solve_poses(self) -> None:

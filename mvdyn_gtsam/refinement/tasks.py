@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_depth import filled
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig
+from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import Pair
 from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
@@ -26,14 +27,18 @@ from mvdyn_gtsam.refinement.initial import (
     most_telling,
     moving_regions,
     region_depth,
+    regions,
     static_residual,
 )
 from mvdyn_gtsam.refinement.measurement import measure_pair, sweep_frame
+from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
+from mvdyn_gtsam.refinement.planes import PlainRegion, fill_plain, plain_regions, planes_in_world
 from mvdyn_gtsam.refinement.samples import FrameSample
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.workspace import Workspace
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 TRUSTED_SIGMA = 0.05
 """Standard deviation of log depth at which a pixel's depth counts half as its own and half as its
@@ -49,6 +54,9 @@ GUIDE_STEPS = 3
 
 FIRST_DEPTH = "depth 0"
 """The array of the first depth solve, from flow within cameras; it guides the flow between them."""
+
+PLANES = "planes"
+"""The list ``(N, 7)`` of all planes of plain regions: camera, time, and ``planes_in_world``."""
 
 STATIC, MOVING, UNEXPLAINED = 0, 1, 2
 """Of the array ``moving``: nothing moves; it moves and the views of its instant tell its depth; they do
@@ -134,14 +142,18 @@ def settle_task(context: Context, frame: Frame) -> None:
     near = [edge for edge in edges if abs(edge.j[1] - frame[1]) <= max(config.temporal_offsets, default=0)]
     votes = [np.asarray(workspace.read("fails", edge.j)) for edge in near]
     labels = moving_regions(np.asarray(workspace.read("fails", frame)), near, votes, config)
+    # flow that a static depth explains is the best evidence against motion
+    explained = static_residual(np.exp(theta), edges) < config.moving_px
+    around = grown(labels > 0, config) & ~explained | (labels > 0)
     information = context.image("information", frame)
     trust = information / (information + np.float32(TRUSTED_SIGMA**-2))
-    trust[labels > 0] = 0.0
+    trust[around] = 0.0
     # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
     # an average of depth cubed leans to the far side
     if trust.max() > LEAST_TRUST:
         cubed = filled(np.exp(-3.0 * theta).astype(np.float32), trust)
         theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
+        labels = _outlined(context, frame, labels > 0, around, theta)
     else:
         # a camera that stands still has no parallax of its own: the others' flow will tell
         theta = np.log(context.image("aligned", frame))
@@ -159,6 +171,43 @@ def settle_task(context: Context, frame: Frame) -> None:
     workspace.write("prior_weight", frame, weight)
     workspace.write("moving", frame, moving)
     workspace.write("begun", frame, np.exp(theta))
+
+
+def _outlined(
+    context: Context, frame: Frame, moves: Mask, around: Mask, theta: Float32
+) -> npt.NDArray[np.int32]:
+    """Label ``(h, w)`` of the regions that move, with outlines found against what stands behind; ``theta (h,
+    w)`` is that of the background."""
+    if not moves.any():
+        return np.zeros(moves.shape, np.int32)
+    workspace, wTc = context.workspace, context.poses()
+    view, (camera, time) = workspace.views[frame[0]], frame
+    offsets = context.config.background_offsets
+    times = [t for k in offsets for t in (time - k, time + k) if 0 <= t < workspace.frame_count]
+    others = [
+        OtherTime(
+            grey=_luminance(context, (camera, t)),
+            moves=grown(
+                np.asarray(workspace.read("fails", (camera, t)), np.uint8) > 0, context.config
+            ).astype(np.uint8),
+            jTi=invert_pose(wTc[camera, t]) @ wTc[frame],
+        )
+        for t in times
+    ]
+    pixels = np.flatnonzero(around)
+    behind = np.full(moves.shape, np.nan, np.float32)
+    behind.ravel()[pixels] = background(
+        np.exp(theta.ravel()[pixels]), view.rays[pixels], view.intrinsics, others
+    )
+    found = outlined(moves, around, _luminance(context, frame), behind, context.config)
+    return regions(found.astype(np.uint8), context.config)
+
+
+def _luminance(context: Context, frame: Frame) -> Float32:
+    """``(h, w)`` without the noise of single pixels."""
+    grey = np.asarray(context.workspace.read("grey", frame), np.uint8)
+    small = context.workspace.views[frame[0]].shrink(cv2.GaussianBlur(grey, (0, 0), 1.0))
+    return np.asarray(small, np.float32)
 
 
 def window_task(context: Context, window: tuple[str, str, int, int, int]) -> None:
@@ -192,6 +241,44 @@ def window_task(context: Context, window: tuple[str, str, int, int, int]) -> Non
             if first <= frame[1] < end:
                 workspace.write(target, frame, np.exp(theta))
                 workspace.write("information", frame, information)
+
+
+def planes_task(context: Context, job: tuple[str, Frame]) -> Array:
+    """Planes ``(N, 5)`` in the world that the rims of a frame's plain regions fit: ``(read from, frame)``."""
+    name, frame = job
+    found, _ = _plain_regions(context, name, frame)
+    return planes_in_world(found, context.poses()[frame])
+
+
+def fill_task(context: Context, job: tuple[str, str, Frame]) -> None:
+    """Give a frame's plain regions the planes that the frames around agree on: ``(read from, write to,
+    frame)``."""
+    source, target, frame = job
+    found, trust = _plain_regions(context, source, frame)
+    bank = context.workspace.read_array(PLANES)
+    near = np.abs(bank[:, 1] - frame[1]) <= context.config.plain.window
+    near &= np.isin(bank[:, 0], context.group_of(frame[0]))
+    theta = fill_plain(
+        np.log(context.image(source, frame)),
+        trust,
+        found,
+        bank[near, 2:],
+        context.poses()[frame],
+        context.config.plain,
+    )
+    context.workspace.write(target, frame, np.exp(theta))
+
+
+def _plain_regions(context: Context, name: str, frame: Frame) -> tuple[list[PlainRegion], Float32]:
+    """Plain regions of a frame, and the trust ``(h, w)`` in its depth; nothing of what moves is trusted."""
+    workspace, view = context.workspace, context.workspace.views[frame[0]]
+    information = context.image("information", frame)
+    trust = information / (information + np.float32(TRUSTED_SIGMA**-2))
+    moves = (np.asarray(workspace.read("moving", frame)) != STATIC).astype(np.uint8)
+    trust[cv2.dilate(moves, np.ones((5, 5), np.uint8)) > 0] = 0.0
+    theta, grey = np.log(context.image(name, frame)), _luminance(context, frame)
+    found = plain_regions(grey, theta, trust, moves > 0, view.rays, context.config.plain, seed=frame)
+    return found, trust
 
 
 def sample_task(context: Context, job: tuple[str, Frame]) -> FrameSample:
@@ -318,9 +405,7 @@ def upsample(inverse_depth: Float32, grey: npt.NDArray[np.uint8], contrast: floa
 
 
 def _image_weights(context: Context, frame: Frame) -> tuple[Float32, Float32]:
-    grey = np.asarray(context.workspace.read("grey", frame), np.uint8)
-    small = context.workspace.views[frame[0]].shrink(cv2.GaussianBlur(grey, (0, 0), 1.0))
-    return smoothness_weights(np.asarray(small, np.float32), context.config.edge_contrast)
+    return smoothness_weights(_luminance(context, frame), context.config.edge_contrast)
 
 
 def run_task(context: Context, task: str, job: object) -> object:
@@ -335,6 +420,8 @@ TASKS = {
     "begin": begin_task,
     "settle": settle_task,
     "window": window_task,
+    "planes": planes_task,
+    "plain regions": fill_task,
     "sample": sample_task,
     "finish": finish_task,
 }

@@ -1,0 +1,90 @@
+"""The outline of what moves: where an image differs from what stands behind it.
+
+Flow is smooth and says where something moves, but not where it ends. What stands behind it is seen at other
+times: its pixels there, found through its depth, have the luminance that this pixel would have if nothing
+stood before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+WITNESSES = 2
+"""Other times that must see a background pixel."""
+NOTHING = -1000.0
+"""Luminance outside an image."""
+
+
+@dataclass(frozen=True)
+class OtherTime:
+    """The same camera at another time."""
+
+    grey: Float32
+    """``(h, w)``"""
+    moves: npt.NDArray[np.uint8]
+    """``(h, w)`` 1 where something may move: no background."""
+    jTi: Array
+    """``(4, 4)``"""
+
+
+def background(
+    inverse_depth: Float32, rays: Float32, intrinsics: Array, others: Sequence[OtherTime]
+) -> Float32:
+    """Luminance ``(M,)`` of what stands at ``inverse_depth (M,)`` along ``rays (M, 3)``.
+
+    The median of the other times that see it, NaN with fewer than two. ``intrinsics (3, 3)`` are those of the
+    images.
+    """
+    seen = np.full((len(others), len(rays)), np.nan, np.float32)
+    for row, other in zip(seen, others, strict=True):
+        # scaled by the inverse depth: finite at infinity
+        point = rays @ other.jTi[:3, :3].T + inverse_depth[:, None] * other.jTi[:3, 3]
+        front = point[:, 2] > 1e-6
+        pixel = (point / np.where(front, point[:, 2], 1.0)[:, None]) @ intrinsics.T
+        at = [np.ascontiguousarray(pixel[None, :, axis], dtype=np.float32) for axis in (0, 1)]
+        value = _sampled(other.grey, at, NOTHING)
+        free = front & (value > 0.5 * NOTHING) & (_sampled(other.moves.astype(np.float32), at, 1.0) < 0.1)
+        row[free] = value[free]
+    count = np.isfinite(seen).sum(axis=0)
+    result = np.full(len(rays), np.nan, np.float32)
+    known = count >= WITNESSES
+    result[known] = np.nanmedian(seen[:, known], axis=0)
+    return result
+
+
+def grown(mask: Mask, config: RefinementConfig) -> Mask:
+    """``mask (h, w)`` and what is near enough to belong to it."""
+    radius = max(1, round(config.moving_reach * mask.shape[1]))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0)
+
+
+def outlined(mask: Mask, around: Mask, grey: Float32, behind: Float32, config: RefinementConfig) -> Mask:
+    """Pixels of ``around (h, w)`` that differ from what stands ``behind (h, w)`` them; where that is NaN,
+    those of ``mask (h, w)``."""
+    known = np.isfinite(behind) & around
+    difference = np.where(known, np.abs(grey - behind), 0.0).astype(np.float32)
+    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.0)
+    difference = cv2.GaussianBlur(difference, (0, 0), 1.0) / np.maximum(weight, 1e-3)
+    moves = np.where(known, difference > config.moving_contrast, mask & around).astype(np.uint8)
+    moves = cv2.medianBlur(moves, 5)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+    return np.asarray((cv2.morphologyEx(moves, cv2.MORPH_CLOSE, kernel) > 0) & around)
+
+
+def _sampled(image: Float32, at: Sequence[Float32], outside: float) -> Float32:
+    """``(M,)`` of ``image (h, w)`` at columns and rows ``(1, M)``."""
+    value = cv2.remap(
+        image, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
+    )
+    return np.asarray(value[0], np.float32)

@@ -1,0 +1,234 @@
+"""Depth of plain regions: the plane that their rims share over many frames.
+
+On a wall or ceiling without texture no flow says anything, but its rim is seen: where it meets other
+surfaces and where its texture begins. A plane is fitted to each rim. One frame's rim leaves several planes
+open (a ceiling that meets one wall may be that wall, too), so a region takes the plane on which the rims of
+all frames around agree best, as far as it fits its own rim. Piecewise planar stereo
+(https://doi.org/10.1109/ICCV.2009.5459417) has the idea that plain regions take planes found elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.refinement.settings import PlainConfig
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+HYPOTHESES = 150
+"""Planes through three points of a rim that are tried."""
+PLANES_PER_RIM = 3
+"""Different planes kept of one rim at most."""
+RIM_POINTS = 300
+"""Points of a rim looked at, drawn at random beyond."""
+LEAST_POINTS = 20
+"""Of a rim that is believed."""
+LEAST_TRUST = 0.05
+"""Trust from which a pixel counts as seen."""
+WELL_SEEN = 0.5
+"""Mean trust from which a region needs no plane."""
+JUDGED_PIXELS = 60
+"""Pixels of a region at which planes are compared."""
+WITNESSES = 3
+"""Planes, of this frame or others, that must agree."""
+
+
+@dataclass(frozen=True)
+class PlainRegion:
+    """A plain region and the planes ``q`` that its rim fits: ``q . ray`` is the inverse depth along a ray
+    with z = 1."""
+
+    pixels: npt.NDArray[np.int64]
+    """``(M,)`` flat indices of the region, grown to the image's edge around it."""
+    rays: Array
+    """``(M, 3)``"""
+    rim_rays: Array
+    """``(R, 3)``"""
+    rim_inverse_depth: Array
+    """``(R,)``"""
+    rim_trust: Array
+    """``(R,)``"""
+    planes: Array
+    """``(K, 3)``"""
+    shares: Array
+    """``(K,)`` of the rim's trust that each explains."""
+
+
+def plain_regions(
+    grey: Float32,
+    theta: Float32,
+    trust: Float32,
+    excluded: Mask,
+    rays: Float32,
+    config: PlainConfig,
+    seed: Sequence[int],
+) -> list[PlainRegion]:
+    """Regions of the image ``grey (h, w)`` without contrast whose depth is little trusted.
+
+    ``theta (h, w)`` is log inverse depth, ``trust (h, w)`` how far it is believed, in [0, 1]; pixels of
+    ``excluded (h, w)`` belong to no region; ``rays (h w, 3)`` has z = 1; ``seed`` makes the draw of points
+    repeatable.
+    """
+    random = np.random.default_rng(seed)
+    found = []
+    for region in _without_contrast(grey, excluded, config):
+        if trust[region > 0].mean() > WELL_SEEN:
+            continue
+        rim = cv2.dilate(region, np.ones((2 * config.rim + 1,) * 2, np.uint8)) > 0
+        points = np.flatnonzero(rim.ravel() & (trust.ravel() > LEAST_TRUST))
+        if len(points) < LEAST_POINTS:
+            continue
+        if len(points) > RIM_POINTS:
+            points = random.choice(points, RIM_POINTS, replace=False)
+        rim_rays, weight = rays[points].astype(np.float64), trust.ravel()[points].astype(np.float64)
+        inverse_depth = np.exp(theta.ravel()[points]).astype(np.float64)
+        planes, shares = _planes_of(rim_rays, inverse_depth, weight, config, random)
+        pixels = np.flatnonzero(cv2.dilate(region, np.ones((5, 5), np.uint8)).ravel())
+        found.append(
+            PlainRegion(
+                pixels, rays[pixels].astype(np.float64), rim_rays, inverse_depth, weight, planes, shares
+            )
+        )
+    return found
+
+
+def planes_in_world(regions: Sequence[PlainRegion], wTc: Array) -> Array:
+    """``(N, 5)``: unit normal and offset, ``n . p = d``, of every region's planes, and its say."""
+    rows = []
+    for region in regions:
+        for plane, share in zip(region.planes, region.shares, strict=True):
+            normal = wTc[:3, :3] @ plane
+            length = np.linalg.norm(normal)
+            offset = (1.0 + normal @ wTc[:3, 3]) / length
+            rows.append([*(normal / length), offset, share * np.sqrt(len(region.pixels))])
+    return np.array(rows).reshape(-1, 5)
+
+
+def planes_in_camera(world: Array, wTc: Array) -> Array:
+    """``(N, 3)`` planes ``q`` of a camera, from normals and offsets ``(N, 4)``; NaN for one through its
+    centre."""
+    normal = world[:, :3] @ wTc[:3, :3]
+    distance = world[:, 3] - world[:, :3] @ wTc[:3, 3]
+    return normal / np.where(np.abs(distance) > 1e-9, distance, np.nan)[:, None]
+
+
+def fill_plain(
+    theta: Float32,
+    trust: Float32,
+    regions: Sequence[PlainRegion],
+    bank: Array,
+    wTc: Array,
+    config: PlainConfig,
+) -> Float32:
+    """``theta (h, w)`` with the agreed plane in every region, as far as ``trust (h, w)`` leaves room.
+
+    ``bank (N, 5)`` are the planes of all frames around, this one's among them. A region on which they do not
+    agree keeps its depth.
+    """
+    planes, weight = planes_in_camera(bank[:, :4], wTc), bank[:, 4]
+    result = theta.copy()
+    for region in regions:
+        plane = agreed_plane(region, planes, weight, config)
+        if plane is None:
+            continue
+        low, high = _range(region, config)
+        filled = np.log(np.clip(region.rays @ plane, low, high)).astype(np.float32)
+        own = trust.ravel()[region.pixels]
+        result.ravel()[region.pixels] = own * theta.ravel()[region.pixels] + (1.0 - own) * filled
+    return result
+
+
+def agreed_plane(region: PlainRegion, planes: Array, weight: Array, config: PlainConfig) -> Array | None:
+    """Of ``planes (N, 3)`` that fit the region's rim the one that most others resemble; None without
+    witnesses."""
+    shares = _share(planes, region.rim_rays, region.rim_inverse_depth, region.rim_trust, config)
+    sample = region.rays[:: max(1, len(region.rays) // JUDGED_PIXELS)]
+    inverse_depth = planes @ sample.T
+    low, high = _range(region, config)
+    inside = ((inverse_depth > low) & (inverse_depth < high)).mean(axis=1) > 0.8
+    fits = np.flatnonzero((shares > config.rim_share) & inside)
+    if len(fits) < WITNESSES:
+        return None
+    log_depth = np.log(np.clip(inverse_depth[fits], low, high))
+    alike = np.abs(log_depth[:, None] - log_depth[None]).mean(axis=2) < config.agreement
+    votes = alike @ (weight * shares)[fits] * shares[fits]
+    best = votes.argmax()
+    return np.asarray(planes[fits[best]]) if alike[best].sum() >= WITNESSES else None
+
+
+def _without_contrast(grey: Float32, excluded: Mask, config: PlainConfig) -> list[npt.NDArray[np.uint8]]:
+    """``(h, w)`` each, 1 in one connected region without contrast."""
+    slope = np.hypot(*(cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, scale=0.125) for dx in (1, 0)))
+    plain = cv2.erode((slope < config.contrast).astype(np.uint8), np.ones((3, 3), np.uint8))
+    plain[excluded] = 0
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(plain, connectivity=4)
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= config.smallest * grey.size]
+    kernel = np.ones((5, 5), np.uint8)
+    return [
+        np.asarray(cv2.morphologyEx((labels == k).astype(np.uint8), cv2.MORPH_CLOSE, kernel)) for k in large
+    ]
+
+
+def _planes_of(
+    rays: Array, inverse_depth: Array, trust: Array, config: PlainConfig, random: np.random.Generator
+) -> tuple[Array, Array]:
+    """The different planes ``(K, 3)`` that points fit, by RANSAC, and the share ``(K,)`` of each."""
+    drawn = random.choice(len(rays), (HYPOTHESES, 3), p=trust / trust.sum())
+    drawn = drawn[np.abs(np.linalg.det(rays[drawn])) > 1e-4]
+    planes: list[Array] = []
+    if len(drawn) > 0:
+        hypotheses = np.linalg.solve(rays[drawn], inverse_depth[drawn][..., None])[..., 0]
+        error = np.abs(hypotheses @ rays.T / inverse_depth - 1.0)
+        score = np.maximum(1.0 - (error / config.tolerance) ** 2, 0.0)
+        left = trust.copy()
+        for _ in range(PLANES_PER_RIM):
+            best = (score @ left).argmax()
+            plane = _fitted(hypotheses[best], rays, inverse_depth, trust, config)
+            if plane is None:
+                break
+            fitting = np.abs(rays @ plane / inverse_depth - 1.0) < config.tolerance
+            left[fitting] = 0.0
+            if _spread(rays[fitting]) >= config.spread:
+                planes.append(plane)
+    found = np.array(planes).reshape(-1, 3)
+    shares = _share(found, rays, inverse_depth, trust, config)
+    kept = shares > 0.25
+    return found[kept], shares[kept]
+
+
+def _fitted(
+    plane: Array, rays: Array, inverse_depth: Array, trust: Array, config: PlainConfig
+) -> Array | None:
+    """``plane`` after weighted least squares on the points that it fits; None with too few."""
+    for _ in range(3):
+        fitting = np.abs(rays @ plane / inverse_depth - 1.0) < config.tolerance
+        if np.count_nonzero(fitting) < LEAST_POINTS // 2:
+            return None
+        root = np.sqrt(trust[fitting]) / inverse_depth[fitting]
+        scaled = rays[fitting] * root[:, None]
+        plane = np.asarray(np.linalg.lstsq(scaled, inverse_depth[fitting] * root, rcond=None)[0], np.float64)
+    return plane
+
+
+def _share(planes: Array, rays: Array, inverse_depth: Array, trust: Array, config: PlainConfig) -> Array:
+    """``(N,)`` of the points' trust that each of ``planes (N, 3)`` explains."""
+    fitting = np.abs(planes @ rays.T / inverse_depth - 1.0) < 1.5 * config.tolerance
+    return np.asarray(fitting @ trust / trust.sum())
+
+
+def _spread(rays: Array) -> float:
+    """How far points are from lying on one line of the image, in focal lengths."""
+    across = rays[:, :2] - rays[:, :2].mean(axis=0)
+    return float(np.sqrt(max(np.linalg.eigvalsh(across.T @ across / max(1, len(rays)))[0], 0.0)))
+
+
+def _range(region: PlainRegion, config: PlainConfig) -> tuple[float, float]:
+    """Inverse depths that are believed in a region: not far from those of its rim."""
+    return config.reach * region.rim_inverse_depth.min(), region.rim_inverse_depth.max() / config.reach

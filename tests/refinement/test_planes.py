@@ -1,0 +1,106 @@
+"""Plain regions and the planes that rims agree on, in a room whose planes are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mvdyn_gtsam.refinement.planes import (
+    PlainRegion,
+    agreed_plane,
+    fill_plain,
+    plain_regions,
+    planes_in_camera,
+    planes_in_world,
+)
+from mvdyn_gtsam.refinement.settings import PlainConfig
+from tests.test_geometry import poses
+
+Array = npt.NDArray[np.float64]
+CONFIG = PlainConfig()
+HEIGHT, WIDTH, FOCAL = 72, 96, 80.0
+COLUMN, ROW = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+RAYS = np.stack([(COLUMN - 47.5) / FOCAL, (ROW - 35.5) / FOCAL, np.ones((HEIGHT, WIDTH))], axis=2).reshape(
+    -1, 3
+)
+BACK = np.array([0.0, 0.0, 0.25])
+"""A wall 4 m away."""
+CEILING = np.array([0.0, -1.0 / 1.2, 0.0])
+"""1.2 m above the camera."""
+SIDE = np.array([1.0 / 1.8, 0.0, 0.0])
+"""1.8 m to the right."""
+
+
+def room() -> tuple[Array, Array]:
+    """Log inverse depth ``(h, w)`` of the nearest surface, and which it is: 0 back, 1 side, 2 ceiling."""
+    inverse_depth = np.stack([(RAYS @ plane).reshape(HEIGHT, WIDTH) for plane in (BACK, SIDE, CEILING)])
+    return np.log(inverse_depth.max(axis=0)), inverse_depth.argmax(axis=0)
+
+
+def view_of_room() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Image of textured walls and a plain ceiling, depth that is wrong on the ceiling, trust, truth."""
+    truth, surface = room()
+    random = np.random.default_rng(0)
+    grey = np.where(surface == 2, 200.0, 100.0 + 40.0 * random.random((HEIGHT, WIDTH))).astype(np.float32)
+    # what is seen ends two pixels inside the ceiling, as windows of a matcher reach that far
+    seen = (surface != 2) | np.roll(surface != 2, -2, axis=0)
+    theta = np.where(seen, truth, np.log(0.25)).astype(np.float32)
+    return grey, theta, np.where(seen, 0.9, 0.0).astype(np.float32), truth
+
+
+def regions_of(seed: int = 0) -> list[PlainRegion]:
+    grey, theta, trust, _ = view_of_room()
+    nothing = np.zeros(grey.shape, bool)
+    return plain_regions(grey, theta, trust, nothing, RAYS.astype(np.float32), CONFIG, (seed, 0))
+
+
+def test_ceiling_takes_the_plane_through_both_walls_rims() -> None:
+    grey, theta, trust, truth = view_of_room()
+    bank = np.concatenate([planes_in_world(regions_of(seed), np.eye(4)) for seed in range(4)])
+    filled = fill_plain(theta, trust, regions_of(), bank, np.eye(4), CONFIG)
+    ceiling = room()[1] == 2
+    before, after = np.abs(theta - truth)[ceiling], np.abs(filled - truth)[ceiling]
+    assert before.mean() > 0.15
+    assert after.mean() < 0.25 * before.mean()
+    np.testing.assert_array_equal(filled[~ceiling & (ROW > 40)], theta[~ceiling & (ROW > 40)])
+
+
+def test_nothing_is_filled_without_witnesses() -> None:
+    _, theta, trust, _ = view_of_room()
+    regions = regions_of()
+    assert len(regions) > 0
+    nobody = np.zeros((0, 5))
+    np.testing.assert_array_equal(fill_plain(theta, trust, regions, nobody, np.eye(4), CONFIG), theta)
+
+
+def test_a_plane_alone_against_many_is_not_taken() -> None:
+    region = regions_of()[0]
+    tilted = CEILING * 1.05
+    planes = np.concatenate([np.tile(CEILING, (5, 1)), tilted[None]])
+    chosen = agreed_plane(region, planes, np.ones(6), CONFIG)
+    assert chosen is not None
+    np.testing.assert_allclose(chosen, CEILING)
+
+
+def test_excluded_pixels_belong_to_no_region() -> None:
+    grey, theta, trust, _ = view_of_room()
+    everything = np.ones(grey.shape, bool)
+    assert plain_regions(grey, theta, trust, everything, RAYS.astype(np.float32), CONFIG, (0, 0)) == []
+
+
+def test_the_draw_is_repeatable() -> None:
+    first, second = regions_of(3), regions_of(3)
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.planes, other.planes)
+
+
+@given(poses(), st.floats(0.1, 10.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+def test_planes_return_from_the_world(wTc: Array, z: float, x: float, y: float) -> None:
+    plane = np.array([x, y, 1.0]) / z
+    region = PlainRegion(np.arange(4), RAYS[:4], RAYS[:4], np.ones(4), np.ones(4), plane[None], np.ones(1))
+    world = planes_in_world([region], wTc)
+    assert np.linalg.norm(world[0, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(planes_in_camera(world[:, :4], wTc)[0], plane, rtol=1e-5, atol=1e-6)
