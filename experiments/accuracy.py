@@ -1,9 +1,13 @@
-"""Our accuracy, time and memory against COLMAP and GLOMAP, over many captures, as one table.
+"""Our accuracy, time and memory against COLMAP, GLOMAP and others, over many captures, as one table.
 
-Every method runs as `mvdyn compare` runs it: in a process of its own, on the same frames, one by one.
-Each (capture, method) is kept as soon as it is done, so an interrupted experiment goes on where it stopped,
-and a change of ours does not cost the hours of the baselines: --again ours runs ours anew. Times are fair
-only between rows made under the same load; the JSON keeps the load of the machine with every row.
+The paper's tables of trajectories. Every method runs as `mvdyn compare` runs it: in a process of its own, on
+the same frames, one by one. Each (capture, method) is kept as soon as it is done, so an interrupted run goes
+on where it stopped, and a change of ours does not cost the hours of the baselines: --again ours runs ours
+anew. Times are fair only between rows made under the same load; the JSON keeps the load of the machine with
+every row.
+
+--method NAME=DIR adds the results of another method made elsewhere: DIR holds one per capture, in a file or
+folder of the capture's name.
 """
 
 from __future__ import annotations
@@ -15,25 +19,34 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from experiments.plots import Entries, bars, scores_value
 from experiments.records import (
-    RESULTS,
-    ROOT,
+    ExperimentError,
     Page,
     Run,
-    captures_or_rendered,
+    captures_of,
+    experiment_parser,
     figure,
     finite,
     key_of,
+    parse,
     run_experiment,
+    settings_arguments,
     table,
 )
+from mvdyn_gtsam.baselines.settings import BASELINES, BaselineSettings
 from mvdyn_gtsam.config import load_config, to_dict
+from mvdyn_gtsam.errors import MvdynError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NAME = "accuracy"
 OURS = "ours"
 METHODS = (OURS, "colmap", "glomap")
+"""Run where nothing else is asked for."""
 
 COLUMNS = (
     "capture",
@@ -61,34 +74,39 @@ def run_key(capture: Path, method: str, stage: str, overrides: Sequence[str]) ->
 
 
 def measure(
-    capture: Path,
-    method: str,
-    stage: str,
-    overrides: Sequence[str],
-    work: Path,
-    timeout_s: float | None,
+    capture: Path, method: str, options: argparse.Namespace, made_elsewhere: Path | None = None
 ) -> dict[str, Any]:
-    """Run one method on one capture through ``compare``; a failure is an entry that says so."""
+    """Run one method on one capture through ``compare``, or read its result; a failure is an entry, too."""
     from mvdyn_gtsam.baselines import compare
 
     groundtruth = capture / "groundtruth"
-    comparison = compare(
-        capture,
-        groundtruth if groundtruth.is_dir() else None,
-        [method],
-        work / capture.resolve().name / method,
-        stage=stage,
-        # COLMAP and GLOMAP match once; what it took counts for both.
-        database=matches_folder(work, capture),
-        timeout_s=timeout_s,
-        our_arguments=[word for override in overrides for word in ("--set", override)],
-    )
-    result = comparison.results[0]
-    return {
+    entry = {
         "capture": capture.resolve().name,
         "method": method,
-        "stage": stage if method == OURS else None,
-        "overrides": list(overrides) if method == OURS else [],
+        "stage": options.stage if method == OURS else None,
+        "overrides": list(options.overrides) if method == OURS else [],
+    }
+    try:
+        comparison = compare(
+            capture,
+            groundtruth if groundtruth.is_dir() else None,
+            [] if made_elsewhere else [method],
+            options.work / capture.resolve().name / method,
+            imported={method: made_elsewhere} if made_elsewhere else None,
+            stage=options.stage,
+            settings=BaselineSettings(descriptor=options.descriptor),
+            # COLMAP and GLOMAP match once; what it took counts for both.
+            database=matches_folder(options.work, capture),
+            timeout_s=options.timeout,
+            our_arguments=settings_arguments(options.overrides),
+        )
+    except MvdynError as error:
+        # No masks with this capture, a result that cannot be read: the other captures still have theirs.
+        nothing = {"registered": 0.0, "seconds": None, "cpu_seconds": None, "peak_mb": None, "scores": None}
+        return {**entry, "problem": str(error), **nothing}
+    result = comparison.results[0]
+    return {
+        **entry,
         "problem": result.problem,
         "registered": result.registered,
         "seconds": finite(result.seconds),
@@ -138,7 +156,8 @@ def against_best(entries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
         ours, finished = own[0], [e for e in others if e["problem"] is None]
         scored = [e for e in finished if e["scores"] and e["scores"]["ate_m"] is not None]
         best = min(scored, key=lambda e: float(e["scores"]["ate_m"]), default=None)
-        fastest = min(finished, key=lambda e: float(e["seconds"]), default=None)
+        timed = [e for e in finished if e["seconds"] is not None]
+        fastest = min(timed, key=lambda e: float(e["seconds"]), default=None)
         our_ate = ours["scores"]["ate_m"] if ours["scores"] else None
         best_ate = best["scores"]["ate_m"] if best else None
         our_seconds = ours["seconds"] if ours["problem"] is None else None
@@ -206,51 +225,87 @@ def render_best(entries: Sequence[Mapping[str, Any]]) -> str:
     return text
 
 
+def draw(picture: Figure, entries: Entries) -> None:
+    """ATE and time of every method; a cross where one failed."""
+    left, right = picture.subplots(1, 2)
+    bars(left, entries, "capture", "method", scores_value("ate_m", 1e3), "ATE (mm)")
+    timed = [entry for entry in entries if entry["seconds"] is not None]
+    bars(right, timed, "capture", "method", lambda entry: entry["seconds"], "s")
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    result = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    result.add_argument("captures", nargs="*", type=Path, help="default: all of ../shared/data/rendered")
-    result.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    result = experiment_parser(NAME, __doc__, again=False)
+    result.add_argument("--methods", nargs="+", choices=(OURS, *BASELINES), default=list(METHODS))
+    result.add_argument("--method", dest="made_elsewhere", action="append", default=[], metavar="NAME=DIR",
+                        help="results of another method, DIR/<capture>; repeatable")  # fmt: skip
     result.add_argument("--stage", choices=("tracking", "refinement"), default="tracking")
-    result.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
-                        help="change a setting of ours")  # fmt: skip
+    result.add_argument("--descriptor", type=Path, metavar="ONNX",
+                        help="global descriptor of the retrieval methods")  # fmt: skip
     result.add_argument("--timeout", type=float, metavar="SECONDS", help="stop a method after this long")
-    result.add_argument("--work", type=Path, default=ROOT / "out" / NAME, metavar="DIR",
-                        help="where reconstructions and logs go (default: out/accuracy)")  # fmt: skip
-    result.add_argument("--results", type=Path, default=RESULTS, metavar="DIR",
-                        help="where JSON and Markdown go")  # fmt: skip
     result.add_argument("--name", default=NAME, help="of the Markdown file (default: %(default)s)")
-    result.add_argument("--again", nargs="+", choices=METHODS, default=[],
+    result.add_argument("--again", nargs="+", choices=(OURS, *BASELINES), default=[],
                         help="run these anew even where the results hold them")  # fmt: skip
     return result
+
+
+def made_elsewhere(words: Sequence[str], captures: Sequence[Path]) -> list[tuple[Path, str, Path]]:
+    """(capture, method, result) of every ``--method``. Raises ExperimentError where one is not there."""
+    found = []
+    for word in words:
+        name, separator, folder = word.partition("=")
+        if not (name and separator and folder) or name in (OURS, *BASELINES):
+            raise ExperimentError(f"--method {word}: write NAME=DIR, with a name that no method here has")
+        for capture in captures:
+            own = capture.resolve().name
+            there = sorted(Path(folder).iterdir()) if Path(folder).is_dir() else []
+            paths = [path for path in there if own in (path.name, path.stem)]
+            if len(paths) != 1:
+                raise ExperimentError(
+                    f"--method {word}: {folder} has {len(paths)} results called {own}, with or without a"
+                    " suffix; one is wanted"
+                )
+            found.append((capture, name, paths[0]))
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run what is missing, print the table, write it after every run."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    options = parser().parse_args(words)
-    stage, overrides = options.stage, options.overrides
+    options = parse(parser(), words)
 
     def plan() -> list[Run]:
-        captures = captures_or_rendered(options.captures)
+        captures = captures_of(options)
+        others = made_elsewhere(options.made_elsewhere, captures)
+        if any(BASELINES[m].pairing == "retrieval" for m in options.methods if m != OURS):
+            if options.descriptor is None or not options.descriptor.is_file():
+                raise ExperimentError("the retrieval methods need the ONNX model of --descriptor")
         if set(options.again) - {OURS}:
             for capture in captures:  # anew means the matches, too
                 shutil.rmtree(matches_folder(options.work, capture), ignore_errors=True)
-        return [
+        runs = [
             Run(
                 label=f"{capture.name}, {method}",
-                key=run_key(capture, method, stage, overrides),
-                measure=partial(measure, capture, method, stage, overrides, options.work, options.timeout),
+                key=run_key(capture, method, options.stage, options.overrides),
+                measure=partial(measure, capture, method, options),
                 again=method in options.again,
             )
             for capture, method in itertools.product(captures, options.methods)
         ]
+        return runs + [
+            Run(
+                label=f"{capture.name}, {method}",
+                key=key_of(capture=capture.resolve().name, method=method),
+                measure=partial(measure, capture, method, options, path),
+                # Reading takes seconds, and what was made elsewhere may be another by now.
+                again=True,
+            )
+            for capture, method, path in others
+        ]
 
     path = options.results / f"{options.name}.md"
     pages = [
-        Page(path, "Accuracy, time and memory", render),
+        Page(path, "Accuracy, time and memory", render, draw),
         Page(path.with_stem(f"{path.stem}_against_best"), "Ours against the better baseline", render_best),
     ]
     return run_experiment(NAME, words, options.results / f"{NAME}.json", pages, plan)

@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 
 from experiments import accuracy
+from experiments.records import Records
+from mvdyn_gtsam.errors import BaselineError
 
 
 def entry(method: str, ate_m: float | None, seconds: float, **changes: Any) -> dict[str, Any]:
@@ -101,3 +103,64 @@ def test_a_baseline_run_anew_matches_anew(tmp_path: Path, monkeypatch: pytest.Mo
     words = [str(clip), "--results", str(tmp_path), "--work", str(work)]
     assert accuracy.main([*words, "--again", "ours"]) == 0 and matches.is_dir()
     assert accuracy.main([*words, "--again", "glomap"]) == 0 and not matches.exists()
+
+
+def test_results_made_elsewhere_are_read_anew_each_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[tuple[str, Path]] = []
+
+    def fake(capture: Path, method: str, options: object, made: Path) -> dict[str, Any]:
+        read.append((method, made))
+        untimed = {**entry(method, 0.01, 1.0), "seconds": None, "cpu_seconds": None, "peak_mb": None}
+        return {key: value for key, value in untimed.items() if key != "commit"}
+
+    monkeypatch.setattr(accuracy, "measure", fake)
+    Records(tmp_path / "accuracy.json").add(
+        accuracy.run_key(Path("clip"), "ours", "tracking", []), entry("ours", 0.002, 60.0)
+    )
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "clip.npz").touch()
+    (tmp_path / "runs" / "clip2.npz").touch()
+    words = [str(tmp_path / "clip"), "--results", str(tmp_path), "--method", f"vggt={tmp_path / 'runs'}"]
+    words += ["--methods", "ours"]
+    for _ in range(2):
+        assert accuracy.main(words) == 0
+    assert read == 2 * [("vggt", tmp_path / "runs" / "clip.npz")]
+    assert "| clip | vggt | 100.0 | 10.0 |" in (tmp_path / "accuracy.md").read_text()
+    assert (tmp_path / "accuracy.png").is_file()
+    best = (tmp_path / "accuracy_against_best.md").read_text()
+    assert "| clip | 2.0 | 10.0 (vggt) | 0.20 | 60 | none finished | - |" in best
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--method", "vggt"], "NAME=DIR"),
+        (["--method", "colmap=runs"], "NAME=DIR"),
+        (["--method", "vggt=nowhere"], "0 results called clip"),
+        (["--methods", "colmap-retrieval"], "--descriptor"),
+    ],
+)
+def test_what_cannot_be_run_is_said_first(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "clip").mkdir()
+    assert accuracy.main([str(tmp_path / "clip"), "--results", str(tmp_path), *words]) == 1
+    error = capsys.readouterr().err
+    assert said in error and "running" not in error
+
+
+def test_a_capture_without_masks_is_an_entry_that_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuses(*_: object, **__: object) -> None:
+        raise BaselineError("clip: there are no motion masks")
+
+    monkeypatch.setattr("mvdyn_gtsam.baselines.compare", refuses)
+    (tmp_path / "clip").mkdir()
+    words = [str(tmp_path / "clip"), "--results", str(tmp_path), "--methods", "colmap-masks", "glomap-masks"]
+    assert accuracy.main(words) == 0
+    text = (tmp_path / "accuracy.md").read_text()
+    assert "* clip, colmap-masks failed: clip: there are no motion masks" in text and "glomap-masks" in text

@@ -1,6 +1,6 @@
 """Every experiment of ours from end to end on the tiny generated scene, with `--quick`.
 
-The ablations and the table of methods have such tests of their own.
+The ablations have such tests of their own.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 
 from experiments import (
+    accuracy,
     factor_cost,
     flow_accuracy,
     refinement_phases,
     refinement_pictures,
     scaling,
     summary,
-    tracking_sweep,
     wide_baseline,
 )
 
@@ -80,11 +80,13 @@ def test_wide_baseline(results: Path) -> None:
     is_whole(results, "wide_baseline")
 
 
-def test_tracking_sweep(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--quick", "--start-folder", str(results), "--vary", "tracking.robust_px=1.0"]
-    assert tracking_sweep.main(words) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split(" | ")[1] for line in lines[1:]] == ["defaults", "tracking.robust_px=1.0"]
+def test_accuracy_of_ours_and_a_baseline(results: Path) -> None:
+    words = ["--quick", "--results", str(results), "--methods", "ours", "glomap-masks"]
+    assert accuracy.main(words) == 0
+    ours, baseline = runs(results, "accuracy")
+    assert ours["problem"] is None and ours["registered"] == 1.0 and ours["scores"]["ate_m"] < 0.02
+    assert baseline["method"] == "glomap-masks" and baseline["seconds"] > 0.0
+    is_whole(results, "accuracy")
 
 
 def test_flow_accuracy(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
