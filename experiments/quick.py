@@ -15,10 +15,10 @@ def quick_settings(cameras: int = 2, frames: int = 14) -> SceneSettings:
         width=256,
         height=192,
         fps=15.0,
-        overlap=0.65,
+        overlap=0.75,
         texture=1.0,
-        motion=0.3,
-        camera_motion=0.5,
+        motion=0.25,
+        camera_motion=0.9,
         noise=0.005,
     )
 
