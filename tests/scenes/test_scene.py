@@ -224,7 +224,9 @@ def test_overlap_is_what_was_asked_for() -> None:
     # Axes that cross farther ahead put the cameras farther apart.
     near, far = (
         np.linalg.norm(
-            np.subtract(*Scene.build(replace(TINY, meet=meet, camera_motion=0.0)).wTc(0)[:, :3, 3])
+            np.subtract(
+                *Scene.build(replace(TINY, meet=meet, camera_motion=0.0, texture=0.0)).wTc(0)[:, :3, 3]
+            )
         )
         for meet in (0.6, 1.2)
     )
