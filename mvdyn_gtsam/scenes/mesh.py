@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.errors import ConfigError
-from mvdyn_gtsam.geometry import invert_pose, transform_points
 from mvdyn_gtsam.scenes.motion import Array
 from mvdyn_gtsam.scenes.settings import SceneSettings
 from mvdyn_gtsam.scenes.textures import Atlas, Paint, build_atlas
@@ -115,6 +114,11 @@ class Instant:
         self.mesh = mesh
         self.wTb = wTb
         self.vertices = _apply(wTb[mesh.vertex_body], mesh.vertices)
+        corners = self.vertices[mesh.faces]
+        self.anchors = corners[:, 0]
+        """``(F, 3)``: a point of each face's plane, world."""
+        self.face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        """``(F, 3)``, world, not of unit length."""
         self._scene = _embree_scene(self.vertices, mesh.faces)
 
     def shades(self) -> npt.NDArray[np.float32]:
@@ -148,11 +152,10 @@ class View:
 
         The ray caster says which face, in single precision; where on it is computed here, in double.
         """
-        corners = transform_points(invert_pose(self.wTc), self.instant.vertices)[self.instant.mesh.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        offsets = np.einsum("fi,fi->f", normals, corners[:, 0])
-        along = np.einsum("ni,ni->n", normals[hits.face], rays)
-        depth = np.divide(offsets[hits.face], along, out=np.full(len(along), np.nan), where=along != 0.0)
+        normals = self.instant.face_normals
+        away = np.einsum("fi,fi->f", normals, self.instant.anchors - self.wTc[:3, 3])[hits.face]
+        along = np.einsum("ni,ni->n", normals[hits.face], rays @ self.wTc[:3, :3].T)
+        depth = np.divide(away, along, out=np.full(len(along), np.nan), where=along != 0.0)
         depth[hits.face == MISS] = np.nan
         return rays * depth[:, None]
 
