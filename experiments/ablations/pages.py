@@ -120,12 +120,21 @@ def _verdict(entry: Entry, reference: Entry | None) -> str:
         return "says nothing, the start left cameras apart before anything was taken away"
     if own is None:
         return f"fails, where {reference['variant']} does not: the paper's sign"
-    change = f"ATE {1e3 * full:.1f} -> {1e3 * own:.1f} mm, against {reference['variant']}"
+    change = (
+        f"ATE {1e3 * full:.2f} -> {1e3 * own:.2f} mm, between cameras {_apart(reference)} -> {_apart(entry)},"
+        f" against {reference['variant']}"
+    )
     if own > (1.0 + SAME) * full:
         return f"hurts, the paper's sign ({change})"
     if own < (1.0 - SAME) * full:
         return f"HELPS, against the paper's sign ({change})"
     return f"changes next to nothing ({change})"
+
+
+def _apart(entry: Entry) -> str:
+    scores = entry["scores"]
+    millimetres, degrees = scores.get("inter_camera_trans_m"), scores.get("inter_camera_rot_deg")
+    return f"{figure(millimetres, 1, 1e3)} mm {figure(degrees, 3)} deg"
 
 
 def _like(entry: Entry) -> str:
@@ -228,6 +237,8 @@ def plot_of(study: Study) -> Callable[[Figure, Sequence[Entry]], None]:
     """The plot of the study's page."""
     if study.name == "edge_shares":
         return plot_shares
+    if study.name in ("edge_budget", "grid_density"):
+        return plot_costs
     return plot_noise if study.name == "noisy_init" else plot_bars
 
 
@@ -238,6 +249,18 @@ def _captures(entries: Sequence[Entry]) -> list[str]:
 def plot_bars(figure: Figure, entries: Sequence[Entry]) -> None:
     """ATE of every variant, a cluster per capture."""
     bars(figure.add_subplot(), entries, "capture", "variant", scores_value("ate_m", 1e3), "ATE, mm")
+
+
+def plot_costs(figure: Figure, entries: Sequence[Entry]) -> None:
+    """ATE, memory and time side by side: what more of something brings and what it takes."""
+    first, second, third = figure.subplots(1, 3)
+    bars(first, entries, "capture", "variant", scores_value("ate_m", 1e3), "ATE, mm")
+    bars(second, entries, "capture", "variant", lambda entry: entry.get("peak_mb"), "peak memory, MB")
+    bars(third, entries, "capture", "variant", lambda entry: entry.get("cpu_seconds"), "CPU s")
+    for axes in (second, third):
+        legend = axes.get_legend()
+        if legend is not None:
+            legend.remove()
 
 
 def plot_noise(figure: Figure, entries: Sequence[Entry]) -> None:

@@ -242,7 +242,7 @@ WITHOUT = STUDIES["without_init"].variants[2]
 @pytest.mark.parametrize(
     ("ate_m", "said"),
     [
-        (0.2, "hurts, the paper's sign (ATE 2.0 -> 200.0 mm"),
+        (0.2, "hurts, the paper's sign (ATE 2.00 -> 200.00 mm, between cameras 4.0 mm - deg -> 4.0 mm - deg"),
         (0.001, "HELPS, against the paper's sign"),
         (0.00204, "changes next to nothing"),
         (None, "fails, where full method does not"),
@@ -360,3 +360,28 @@ def test_quick_runs_the_sweep(results: Path, capsys: pytest.CaptureFixture[str])
     assert tracking_sweep.main(["--quick", "--results", str(results)]) == 0
     page = (results / "tracking_sweep.md").read_text()
     assert "| full method |" in page and "| tracking.grid_points=192 |" in page and "(failed)" not in page
+
+
+# ---- what is refused -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["edge_shares", "nowhere"], "nowhere"),
+        (["edge_shares", ".", "--set", "tracking.windwo=3"], "tracking.window"),
+    ],
+)
+def test_what_cannot_be_run_is_one_line_before_any_work(
+    words: list[str],
+    named: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "groundtruth").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert ablations.main([*words, "--results", str(tmp_path / "results")]) == 1
+    error = capsys.readouterr().err
+    assert named in error and error.count("\n") == 1
+    assert not (tmp_path / "results").exists()
