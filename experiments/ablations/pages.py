@@ -257,10 +257,11 @@ def plot_costs(figure: Figure, entries: Sequence[Entry]) -> None:
     bars(first, entries, "capture", "variant", scores_value("ate_m", 1e3), "ATE, mm")
     bars(second, entries, "capture", "variant", lambda entry: entry.get("peak_mb"), "peak memory, MB")
     bars(third, entries, "capture", "variant", lambda entry: entry.get("cpu_seconds"), "CPU s")
-    for axes in (second, third):
-        legend = axes.get_legend()
-        if legend is not None:
+    handles, labels = first.get_legend_handles_labels()
+    for axes in (first, second, third):
+        if (legend := axes.get_legend()) is not None:
             legend.remove()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
 
 
 def plot_noise(figure: Figure, entries: Sequence[Entry]) -> None:

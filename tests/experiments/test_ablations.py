@@ -143,9 +143,7 @@ def test_what_studies_have_in_common_is_one_run() -> None:
     keys = {name: {measuring.run_key(clip, v, []) for v in study.variants} for name, study in STUDIES.items()}
     full = measuring.run_key(clip, FULL, [])
     assert all(full in own for own in keys.values())
-    assert all(
-        len(keys[name]) == len(study.variants) or name == "edge_budget" for name, study in STUDIES.items()
-    )
+    assert all(len(keys[name]) == len(study.variants) for name, study in STUDIES.items())
     assert measuring.run_key(clip, FULL, ["tracking.window=20"]) != full
 
 
