@@ -76,12 +76,12 @@ def row(entry: Entry, reference: Entry | None) -> list[str]:
     own, other = ate(entry), ate(reference)
     change = "-"
     if own is not None and other is not None and entry is not reference:
-        change = f"{1e3 * (own - other):+.1f}"
+        change = f"{1e3 * (own - other):+.2f}"
     return [
         entry["capture"],
         entry["variant"] if entry["problem"] is None else f"{entry['variant']} (failed)",
         figure(entry["registered"], 1, 100.0),
-        figure(own, 1, 1e3),
+        figure(own, 2, 1e3),
         change,
         figure(scores.get("rte_m"), 2, 1e3),
         figure(scores.get("rre_deg"), 3),
@@ -174,8 +174,8 @@ def _levels(entries: Sequence[Entry]) -> str:
                 capture,
                 level,
                 f"{len(errors)} of {len(own)}",
-                figure(median(errors) if errors else None, 1, 1e3),
-                figure(max(errors) if errors else None, 1, 1e3),
+                figure(median(errors) if errors else None, 2, 1e3),
+                figure(max(errors) if errors else None, 2, 1e3),
                 figure(median(between) if between and None not in between else None, 1, 1e3),
                 figure(NOISY_START_ATE.get(noise_m), 0, 1e3),
             ]

@@ -263,8 +263,8 @@ def test_rows_are_set_against_the_variant_they_name() -> None:
     study = STUDIES["without_st_graph"]
     full, _, noisy, without = study.variants
     entries = [entry(full, 0.001), entry(noisy, 0.004), entry(without, 0.010)]
-    assert pages.row(entries[2], pages.reference_of(entries, entries[2]))[4] == "+6.0"
-    assert pages.row(entries[1], pages.reference_of(entries, entries[1]))[4] == "+3.0"
+    assert pages.row(entries[2], pages.reference_of(entries, entries[2]))[4] == "+6.00"
+    assert pages.row(entries[1], pages.reference_of(entries, entries[1]))[4] == "+3.00"
     assert pages.row(entries[0], entries[0])[4] == "-"
 
 
@@ -274,7 +274,7 @@ def test_seeds_of_a_level_are_one_line_and_a_lost_one_counts() -> None:
     entries = [entry(FULL, 0.001)]
     entries += [entry(v, error) for v, error in zip(levels, (0.010, 0.020, None), strict=True)]
     text = pages.render(study, entries)
-    assert "| robodog_overlap | 3 deg, 0.10 m | 2 of 3 | 15.0 | 20.0 | 4.0 | 44 |" in text
+    assert "| robodog_overlap | 3 deg, 0.10 m | 2 of 3 | 15.00 | 20.00 | 4.0 | 44 |" in text
 
 
 def test_shares_of_connections_add_up() -> None:
