@@ -124,24 +124,6 @@ def regions(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArra
     return result
 
 
-def region_depth(instant: Float32, region: Mask, tolerance: float = 0.15) -> tuple[Float32, float]:
-    """Inverse depth of a moving region's pixels, in the order of ``instant[region]``, and the share that
-    agree.
-
-    A thing is about as deep as it is near: pixels whose depth from the same instant is farther than
-    ``tolerance`` (relative) from the commonest of the region take that.
-    """
-    values = np.log(instant[region])
-    edges = np.arange(values.min() - 0.1, values.max() + 0.2, 0.1)
-    histogram = np.histogram(values, edges)[0]
-    around = np.convolve(histogram, np.ones(3), "same")
-    centre = edges[around.argmax()] + 0.05
-    close = np.abs(values - centre) < tolerance
-    commonest = np.median(values[close])
-    result = np.where(np.abs(values - commonest) < tolerance, values, commonest)
-    return np.exp(result).astype(np.float32), float(close.mean())
-
-
 def _parallax(edge: Edge, inverse_depth: Float32) -> float:
     """Motion over the image per unit of log depth, px, summed over the edge's pixels."""
     rho = inverse_depth.ravel()[edge.pixels][::16]

@@ -16,7 +16,8 @@ from types import TracebackType
 import cv2
 
 from mvdyn_gtsam.errors import ConfigError, ResultError
-from mvdyn_gtsam.refinement.tasks import Context, run_task
+from mvdyn_gtsam.refinement.context import Context
+from mvdyn_gtsam.refinement.tasks import run_task
 
 PARENT_CHECK_S = 1.0
 """How often a worker looks whether the process it works for is still there."""

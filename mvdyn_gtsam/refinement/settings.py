@@ -136,9 +136,9 @@ class RefinementConfig:
     12: above noise and what an error of pose or depth makes of texture."""
     background_offsets: tuple[int, ...] = (8, 12, 16, 24, 32, 40)
     """Distances in frames, both ways, at which what stands behind is looked for. Source: choice."""
-    moving_agreement: float = 0.2
-    """Share of a moving region whose depth from the same instant must agree before it is believed. Source:
-    choice."""
+    moving_evidence: float = 0.2
+    """How far the images of this or near instants must support a moving region's depth before it is believed.
+    Source: choice."""
     moving_sigma: float = 0.05
     """Standard deviation of that depth, relative. Source: choice."""
     sweep: SweepConfig = field(default_factory=SweepConfig)

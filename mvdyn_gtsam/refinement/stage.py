@@ -19,12 +19,15 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, to_grey
 from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_pairs
+from mvdyn_gtsam.refinement.context import Context
+from mvdyn_gtsam.refinement.motion import LABELS, depth_of_regions
+from mvdyn_gtsam.refinement.moving_depth import RegionDepth
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
 from mvdyn_gtsam.refinement.poses import solve_poses
 from mvdyn_gtsam.refinement.samples import FrameSample, SampleStore
 from mvdyn_gtsam.refinement.scale import solve_scales
 from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.tasks import FIRST_DEPTH, GUIDE_STEPS, PLANES, Context, FinishedFrame, windows
+from mvdyn_gtsam.refinement.tasks import FIRST_DEPTH, GUIDE_STEPS, PLANES, FinishedFrame, windows
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
@@ -128,7 +131,7 @@ class Refinement:
                 self._step("phase 1", self._align)
             if config.phase2:
                 self._step("begin", lambda: self._map("begin", self._frames))
-                self._step("settle", lambda: self._map("settle", self._frames))
+                self._step("settle", self._settle)
                 self._depth = "begun"
                 self._solve_depth(FIRST_DEPTH, min(GUIDE_STEPS, config.depth_iterations))
                 self._step("wide flow", lambda: self._map("wide flow", self._across))
@@ -171,6 +174,7 @@ class Refinement:
         workspace.create("grey", np.uint8, full_size=True)
         workspace.create("moving", np.uint8)
         workspace.create("fails", np.uint8)
+        workspace.create(LABELS, np.uint8)
         for name in (
             "tracked", "tracked_confidence", "aligned", "swept", "instant", "prior", "prior_weight", "first",
             "begun", "information",
@@ -192,6 +196,16 @@ class Refinement:
         workspace.write_array("tracked_poses", tracked.wTc)
         ones, zeros = np.ones(tracked.wTc.shape[:2]), np.zeros(tracked.wTc.shape[:2])
         workspace.write_array("scales", np.stack([ones, zeros]))
+
+    def _settle(self) -> None:
+        """What moves, and the depth that phase 2 begins with."""
+        found: list[list[RegionDepth]] = []
+        for done, regions in enumerate(self._pool.map("settle", self._frames)):
+            assert isinstance(regions, list)
+            found.append(regions)
+            self._progress.update("refine: settle", done + 1, len(self._frames))
+        depths = depth_of_regions(self._context, self._frames, found)
+        self._map("moving depth", list(zip(self._frames, depths, strict=True)))
 
     def _sample(self) -> Callable[[], Iterable[FrameSample]]:
         """Sample every frame once; what is returned reads them back, as often as a solve asks."""

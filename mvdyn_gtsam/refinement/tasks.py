@@ -13,40 +13,29 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mvdyn_gtsam.frontend.dense_depth import filled
-from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig
-from mvdyn_gtsam.geometry import invert_pose
+from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import Pair
+from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
 from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
-from mvdyn_gtsam.refinement.edges import Edge, load_edges
+from mvdyn_gtsam.refinement.edges import Edge
 from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
     best_candidate,
     failing_regions,
     most_telling,
-    moving_regions,
-    region_depth,
-    regions,
     static_residual,
 )
 from mvdyn_gtsam.refinement.measurement import measure_pair, sweep_frame
-from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
+from mvdyn_gtsam.refinement.motion import moving_depth_task, settle_task
 from mvdyn_gtsam.refinement.planes import PlainRegion, fill_plain, plain_regions, planes_in_world
 from mvdyn_gtsam.refinement.samples import FrameSample
-from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.workspace import Workspace
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-TRUSTED_SIGMA = 0.05
-"""Standard deviation of log depth at which a pixel's depth counts half as its own and half as its
-surroundings'."""
 SAMPLE_SPACING = 16
 """Distance of the pixels that phase 1 and the poses see, px of the input."""
-LEAST_TRUST = 0.05
-"""Of the best pixel of a frame; below, there is nothing to continue into the rest."""
 FIRST_STEPS = 2
 """Gauss-Newton steps before it is asked what moves."""
 GUIDE_STEPS = 3
@@ -57,37 +46,6 @@ FIRST_DEPTH = "depth 0"
 
 PLANES = "planes"
 """The list ``(N, 7)`` of all planes of plain regions: camera, time, and ``planes_in_world``."""
-
-STATIC, MOVING, UNEXPLAINED = 0, 1, 2
-"""Of the array ``moving``: nothing moves; it moves and the views of its instant tell its depth; they do
-not."""
-
-
-@dataclass(frozen=True)
-class Context:
-    """What every task needs."""
-
-    workspace: Workspace
-    groups: tuple[tuple[int, ...], ...]
-    neighbours: dict[Frame, tuple[Frame, ...]]
-    config: RefinementConfig
-    flow: DenseFlow
-    flow_config: FlowConfig
-
-    def group_of(self, camera: int) -> tuple[int, ...]:
-        return next(group for group in self.groups if camera in group)
-
-    def poses(self) -> Array:
-        """``(N, T, 4, 4)`` as solved last."""
-        return self.workspace.read_array("poses")
-
-    def image(self, name: str, frame: Frame) -> Float32:
-        return np.asarray(self.workspace.read(name, frame), np.float32)
-
-    def edges(self, frame: Frame, wTc: Array, own_camera: bool) -> list[Edge]:
-        """Measured edges of a frame; with ``own_camera`` those within its camera."""
-        wanted = [j for j in self.neighbours.get(frame, ()) if not own_camera or j[0] == frame[0]]
-        return load_edges(self.workspace, frame, wanted, wTc)
 
 
 def sweep_task(context: Context, frame: Frame) -> None:
@@ -132,82 +90,6 @@ def begin_task(context: Context, frame: Frame) -> None:
     workspace.write("first", frame, theta)
     workspace.write("information", frame, information)
     workspace.write("fails", frame, failing_regions(static_residual(np.exp(theta), edges), config))
-
-
-def settle_task(context: Context, frame: Frame) -> None:
-    """What moves in a frame, by the vote of the frames around it, and the depth that phase 2 begins with."""
-    workspace, config = context.workspace, context.config
-    edges = context.edges(frame, context.poses(), own_camera=True)
-    theta = context.image("first", frame)
-    near = [edge for edge in edges if abs(edge.j[1] - frame[1]) <= max(config.temporal_offsets, default=0)]
-    votes = [np.asarray(workspace.read("fails", edge.j)) for edge in near]
-    labels = moving_regions(np.asarray(workspace.read("fails", frame)), near, votes, config)
-    # flow that a static depth explains is the best evidence against motion
-    explained = static_residual(np.exp(theta), edges) < config.moving_px
-    around = grown(labels > 0, config) & ~explained | (labels > 0)
-    information = context.image("information", frame)
-    trust = information / (information + np.float32(TRUSTED_SIGMA**-2))
-    trust[around] = 0.0
-    # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
-    # an average of depth cubed leans to the far side
-    if trust.max() > LEAST_TRUST:
-        cubed = filled(np.exp(-3.0 * theta).astype(np.float32), trust)
-        theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
-        labels = _outlined(context, frame, labels > 0, around, theta)
-    else:
-        # a camera that stands still has no parallax of its own: the others' flow will tell
-        theta = np.log(context.image("aligned", frame))
-    moving = np.where(labels > 0, UNEXPLAINED, STATIC).astype(np.uint8)
-    instant = context.image("instant", frame)
-    for label in np.unique(labels[labels > 0]) if len(context.group_of(frame[0])) > 1 else ():
-        region = labels == label
-        depth, agreement = region_depth(instant, region)
-        if agreement > config.moving_agreement:
-            theta[region] = np.log(depth)
-            moving[region] = MOVING
-    weight = np.maximum(trust, 1e-3) / np.float32(config.prior_sigma**2)
-    weight[moving == MOVING] = config.moving_sigma**-2
-    workspace.write("prior", frame, theta)
-    workspace.write("prior_weight", frame, weight)
-    workspace.write("moving", frame, moving)
-    workspace.write("begun", frame, np.exp(theta))
-
-
-def _outlined(
-    context: Context, frame: Frame, moves: Mask, around: Mask, theta: Float32
-) -> npt.NDArray[np.int32]:
-    """Label ``(h, w)`` of the regions that move, with outlines found against what stands behind; ``theta (h,
-    w)`` is that of the background."""
-    if not moves.any():
-        return np.zeros(moves.shape, np.int32)
-    workspace, wTc = context.workspace, context.poses()
-    view, (camera, time) = workspace.views[frame[0]], frame
-    offsets = context.config.background_offsets
-    times = [t for k in offsets for t in (time - k, time + k) if 0 <= t < workspace.frame_count]
-    others = [
-        OtherTime(
-            grey=_luminance(context, (camera, t)),
-            moves=grown(
-                np.asarray(workspace.read("fails", (camera, t)), np.uint8) > 0, context.config
-            ).astype(np.uint8),
-            jTi=invert_pose(wTc[camera, t]) @ wTc[frame],
-        )
-        for t in times
-    ]
-    pixels = np.flatnonzero(around)
-    behind = np.full(moves.shape, np.nan, np.float32)
-    behind.ravel()[pixels] = background(
-        np.exp(theta.ravel()[pixels]), view.rays[pixels], view.intrinsics, others
-    )
-    found = outlined(moves, around, _luminance(context, frame), behind, context.config)
-    return regions(found.astype(np.uint8), context.config)
-
-
-def _luminance(context: Context, frame: Frame) -> Float32:
-    """``(h, w)`` without the noise of single pixels."""
-    grey = np.asarray(context.workspace.read("grey", frame), np.uint8)
-    small = context.workspace.views[frame[0]].shrink(cv2.GaussianBlur(grey, (0, 0), 1.0))
-    return np.asarray(small, np.float32)
 
 
 def window_task(context: Context, window: tuple[str, str, int, int, int]) -> None:
@@ -272,11 +154,10 @@ def fill_task(context: Context, job: tuple[str, str, Frame]) -> None:
 def _plain_regions(context: Context, name: str, frame: Frame) -> tuple[list[PlainRegion], Float32]:
     """Plain regions of a frame, and the trust ``(h, w)`` in its depth; nothing of what moves is trusted."""
     workspace, view = context.workspace, context.workspace.views[frame[0]]
-    information = context.image("information", frame)
-    trust = information / (information + np.float32(TRUSTED_SIGMA**-2))
+    trust = context.trust(frame)
     moves = (np.asarray(workspace.read("moving", frame)) != STATIC).astype(np.uint8)
     trust[cv2.dilate(moves, np.ones((5, 5), np.uint8)) > 0] = 0.0
-    theta, grey = np.log(context.image(name, frame)), _luminance(context, frame)
+    theta, grey = np.log(context.image(name, frame)), context.luminance(frame)
     found = plain_regions(grey, theta, trust, moves > 0, view.rays, context.config.plain, seed=frame)
     return found, trust
 
@@ -340,9 +221,8 @@ def finish_task(context: Context, job: tuple[str, Frame]) -> FinishedFrame:
     """Depth, confidence and motion mask of a frame from the array named first."""
     name, frame = job
     view = context.workspace.views[frame[0]]
-    information = context.image("information", frame)
     # as in tracking: confidence falls to a half at 5 % error
-    confidence = information / (information + np.float32(TRUSTED_SIGMA**-2))
+    confidence = context.trust(frame)
     moving = np.asarray(context.workspace.read("moving", frame))
     confidence[moving == MOVING] = np.maximum(confidence, 0.5)[moving == MOVING]
     confidence[moving == UNEXPLAINED] = 0.0
@@ -405,7 +285,7 @@ def upsample(inverse_depth: Float32, grey: npt.NDArray[np.uint8], contrast: floa
 
 
 def _image_weights(context: Context, frame: Frame) -> tuple[Float32, Float32]:
-    return smoothness_weights(_luminance(context, frame), context.config.edge_contrast)
+    return smoothness_weights(context.luminance(frame), context.config.edge_contrast)
 
 
 def run_task(context: Context, task: str, job: object) -> object:
@@ -419,6 +299,7 @@ TASKS = {
     "wide flow": wide_flow_task,
     "begin": begin_task,
     "settle": settle_task,
+    "moving depth": moving_depth_task,
     "window": window_task,
     "planes": planes_task,
     "plain regions": fill_task,

@@ -18,7 +18,6 @@ from mvdyn_gtsam.refinement.initial import (
     failing_regions,
     most_telling,
     moving_regions,
-    region_depth,
     static_residual,
 )
 from mvdyn_gtsam.refinement.residuals import confidence
@@ -220,34 +219,6 @@ def test_two_blocks_are_two_regions_and_a_speck_is_none() -> None:
     labels = moving_regions(own, [], [], CONFIG)
     assert {labels[16, 16], labels[41, 61]} == {1, 2} == set(np.unique(labels)) - {0}
     assert (labels[:9, 56:] == 0).all()
-
-
-def test_a_region_takes_its_commonest_depth() -> None:
-    rng = np.random.default_rng(1)
-    region = square(20, 30, 10)
-    instant = np.full(VIEW.shape, 0.1, np.float32)
-    values = 0.5 * np.exp(rng.normal(0.0, 0.01, 100))
-    values[:20] = rng.uniform(0.1, 0.3, 20)
-    values[20:35] = rng.uniform(0.7, 2.0, 15)
-    instant[region] = values
-    depth, agreement = region_depth(instant, region)
-    assert agreement == pytest.approx(0.65, abs=0.03)
-    np.testing.assert_allclose(depth[35:], values[35:], rtol=1e-5)
-    np.testing.assert_allclose(depth[:35], 0.5, rtol=0.02)
-
-
-def test_a_region_without_agreement_says_so() -> None:
-    region = square(20, 30, 20)
-    instant = np.exp(np.random.default_rng(2).uniform(-3.0, 1.0, VIEW.shape)).astype(np.float32)
-    assert region_depth(instant, region)[1] < CONFIG.moving_agreement
-
-
-@pytest.mark.parametrize("value", [0.01, 0.3, 0.5, 1.0, 7.3])
-def test_a_region_of_one_depth_agrees_wholly(value: float) -> None:
-    region = square(2, 3, 5)
-    depth, agreement = region_depth(np.full(VIEW.shape, value, np.float32), region)
-    assert agreement == 1.0
-    np.testing.assert_allclose(depth, value, rtol=1e-6)
 
 
 def test_temporal_edges_of_what_moves_lose_their_weight_by_themselves(

@@ -16,9 +16,10 @@ import pytest
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import ConfigError, ResultError
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
+from mvdyn_gtsam.refinement.context import Context
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
 from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.tasks import Context, windows
+from mvdyn_gtsam.refinement.tasks import windows
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 

@@ -1,0 +1,63 @@
+"""What every task of the refinement is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.edges import Edge, load_edges
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.workspace import Workspace
+
+Array = npt.NDArray[np.float64]
+
+TRUSTED_SIGMA = 0.05
+"""Standard deviation of log depth at which a pixel's depth counts half as its own and half as its
+surroundings'."""
+
+STATIC, MOVING, UNEXPLAINED = 0, 1, 2
+"""Of the array ``moving``: nothing moves; it moves and the views of its instant tell its depth; they do
+not."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What every task needs."""
+
+    workspace: Workspace
+    groups: tuple[tuple[int, ...], ...]
+    neighbours: dict[Frame, tuple[Frame, ...]]
+    config: RefinementConfig
+    flow: DenseFlow
+    flow_config: FlowConfig
+
+    def group_of(self, camera: int) -> tuple[int, ...]:
+        return next(group for group in self.groups if camera in group)
+
+    def poses(self) -> Array:
+        """``(N, T, 4, 4)`` as solved last."""
+        return self.workspace.read_array("poses")
+
+    def image(self, name: str, frame: Frame) -> Float32:
+        return np.asarray(self.workspace.read(name, frame), np.float32)
+
+    def edges(self, frame: Frame, wTc: Array, own_camera: bool) -> list[Edge]:
+        """Measured edges of a frame; with ``own_camera`` those within its camera."""
+        wanted = [j for j in self.neighbours.get(frame, ()) if not own_camera or j[0] == frame[0]]
+        return load_edges(self.workspace, frame, wanted, wTc)
+
+    def luminance(self, frame: Frame) -> Float32:
+        """``(h, w)`` without the noise of single pixels."""
+        grey = np.asarray(self.workspace.read("grey", frame), np.uint8)
+        small = self.workspace.views[frame[0]].shrink(cv2.GaussianBlur(grey, (0, 0), 1.0))
+        return np.asarray(small, np.float32)
+
+    def trust(self, frame: Frame) -> Float32:
+        """``(h, w)`` in [0, 1], how far the flow settles the depth solved last."""
+        information = self.image("information", frame)
+        return information / (information + np.float32(TRUSTED_SIGMA**-2))

@@ -1,0 +1,162 @@
+"""What moves in a frame, and where phase 2 begins with it.
+
+Three steps, since a frame asks others: ``settle_task`` finds what moves, its outline and what each region's
+instant says of its depth; ``smooth_over_time`` makes that one over time; ``moving_depth_task`` writes it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.dense_depth import filled
+from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.geometry import invert_pose
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
+from mvdyn_gtsam.refinement.initial import moving_regions, regions, static_residual
+from mvdyn_gtsam.refinement.moving_depth import (
+    InstantView,
+    RegionDepth,
+    commonest,
+    link,
+    region_depth,
+    smooth_over_time,
+    support,
+)
+from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
+
+Mask = npt.NDArray[np.bool_]
+Labels = npt.NDArray[np.int32]
+
+LEAST_TRUST = 0.05
+"""Of the best pixel of a frame; below, there is nothing to continue into the rest."""
+
+LABELS = "labels"
+"""The array of moving regions, numbered from 1 in every frame."""
+
+
+def settle_task(context: Context, frame: Frame) -> list[RegionDepth]:
+    """What moves in a frame, by the vote of the frames around it, and the depth of what stands still.
+
+    Returns what the views of the frame's instant say of each moving region.
+    """
+    workspace, config = context.workspace, context.config
+    edges = context.edges(frame, context.poses(), own_camera=True)
+    theta = context.image("first", frame)
+    near = [edge for edge in edges if abs(edge.j[1] - frame[1]) <= max(config.temporal_offsets, default=0)]
+    votes = [np.asarray(workspace.read("fails", edge.j)) for edge in near]
+    labels = moving_regions(np.asarray(workspace.read("fails", frame)), near, votes, config)
+    # flow that a static depth explains is the best evidence against motion
+    explained = static_residual(np.exp(theta), edges) < config.moving_px
+    around = grown(labels > 0, config) & ~explained | (labels > 0)
+    trust = context.trust(frame)
+    trust[around] = 0.0
+    # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
+    # an average of depth cubed leans to the far side
+    if trust.max() > LEAST_TRUST:
+        cubed = filled(np.exp(-3.0 * theta).astype(np.float32), trust)
+        theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
+        labels = _outlined(context, frame, labels > 0, around, theta)
+    else:
+        # a camera that stands still has no parallax of its own: the others' flow will tell
+        theta = np.log(context.image("aligned", frame))
+    workspace.write("prior", frame, theta)
+    workspace.write("prior_weight", frame, np.maximum(trust, 1e-3) / np.float32(config.prior_sigma**2))
+    workspace.write(LABELS, frame, labels.astype(np.uint8))
+    return _observed(context, frame, labels)
+
+
+def depth_of_regions(
+    context: Context, frames: list[Frame], found: list[list[RegionDepth]]
+) -> list[dict[int, float]]:
+    """Log inverse depth by label of the moving regions of each of ``frames``, those that can be believed.
+
+    ``found`` is what ``settle_task`` returned for each.
+    """
+    regions_found = [region for each in found for region in each]
+    number = {(region.frame, region.label): k for k, region in enumerate(regions_found)}
+    links = []
+    with_regions = {region.frame for region in regions_found}
+    for camera, time in with_regions:
+        before = (camera, time - 1)
+        if before in with_regions:
+            labels = [
+                np.asarray(context.workspace.read(LABELS, f), np.int32) for f in (before, (camera, time))
+            ]
+            for a, b in link(labels[0], labels[1]):
+                links.append((number[before, a], number[(camera, time), b]))
+    result: dict[Frame, dict[int, float]] = {frame: {} for frame in frames}
+    if regions_found:
+        solved, belief = smooth_over_time(regions_found, sorted(links))
+        for region, theta, believed in zip(regions_found, solved, belief, strict=True):
+            if believed > context.config.moving_evidence:
+                result[region.frame][region.label] = float(theta)
+    return [result[frame] for frame in frames]
+
+
+def moving_depth_task(context: Context, job: tuple[Frame, dict[int, float]]) -> None:
+    """Where phase 2 begins: what stands still as settled, moving regions at the log inverse depth given."""
+    frame, depths = job
+    workspace, config = context.workspace, context.config
+    labels = np.asarray(workspace.read(LABELS, frame))
+    theta, weight = context.image("prior", frame), context.image("prior_weight", frame)
+    moving = np.where(labels > 0, UNEXPLAINED, STATIC).astype(np.uint8)
+    instant = context.image("instant", frame)
+    for label, depth in depths.items():
+        region = labels == label
+        theta[region] = np.log(region_depth(instant, region, depth))
+        moving[region] = MOVING
+    weight[moving == MOVING] = config.moving_sigma**-2
+    workspace.write("prior", frame, theta)
+    workspace.write("prior_weight", frame, weight)
+    workspace.write("moving", frame, moving)
+    workspace.write("begun", frame, np.exp(theta))
+
+
+def _observed(context: Context, frame: Frame, labels: Labels) -> list[RegionDepth]:
+    """What the other cameras of the instant say of each region."""
+    workspace, wTc = context.workspace, context.poses()
+    others = [(camera, frame[1]) for camera in context.group_of(frame[0]) if camera != frame[0]]
+    if not others or not labels.any():
+        return []
+    views = [
+        InstantView(context.luminance(j), workspace.views[j[0]].intrinsics, invert_pose(wTc[j]) @ wTc[frame])
+        for j in others
+    ]
+    grey, instant = context.luminance(frame), context.image("instant", frame)
+    rays = workspace.views[frame[0]].rays
+    found = []
+    for label in range(1, labels.max() + 1):
+        depth = commonest(instant, labels == label)
+        evidence = support(grey, labels == label, depth, rays, views)
+        found.append(RegionDepth(frame, label, depth, evidence))
+    return found
+
+
+def _outlined(context: Context, frame: Frame, moves: Mask, around: Mask, theta: Float32) -> Labels:
+    """Label ``(h, w)`` of the regions that move, with outlines found against what stands behind; ``theta (h,
+    w)`` is that of the background."""
+    if not moves.any():
+        return np.zeros(moves.shape, np.int32)
+    workspace, wTc = context.workspace, context.poses()
+    view, (camera, time) = workspace.views[frame[0]], frame
+    offsets = context.config.background_offsets
+    times = [t for k in offsets for t in (time - k, time + k) if 0 <= t < workspace.frame_count]
+    others = [
+        OtherTime(
+            grey=context.luminance((camera, t)),
+            moves=grown(
+                np.asarray(workspace.read("fails", (camera, t)), np.uint8) > 0, context.config
+            ).astype(np.uint8),
+            jTi=invert_pose(wTc[camera, t]) @ wTc[frame],
+        )
+        for t in times
+    ]
+    pixels = np.flatnonzero(around)
+    behind = np.full(moves.shape, np.nan, np.float32)
+    behind.ravel()[pixels] = background(
+        np.exp(theta.ravel()[pixels]), view.rays[pixels], view.intrinsics, others
+    )
+    found = outlined(moves, around, context.luminance(frame), behind, context.config)
+    return regions(found.astype(np.uint8), context.config)

@@ -1,0 +1,122 @@
+"""Depth of moving regions: what one instant says, and what the frames before and after make of it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.refinement.moving_depth import (
+    InstantView,
+    RegionDepth,
+    commonest,
+    link,
+    region_depth,
+    smooth_over_time,
+    support,
+)
+
+SHAPE = (60, 80)
+REGION = np.zeros(SHAPE, bool)
+REGION[20:40, 30:50] = True
+INTRINSICS = np.array([[70.0, 0.0, 39.5], [0.0, 70.0, 29.5], [0.0, 0.0, 1.0]])
+RAYS = np.stack(
+    [
+        (np.tile(np.arange(80), 60) - 39.5) / 70.0,
+        (np.repeat(np.arange(60), 80) - 29.5) / 70.0,
+        np.ones(4800),
+    ],
+    axis=1,
+).astype(np.float32)
+
+
+def test_a_region_takes_its_commonest_depth() -> None:
+    rng = np.random.default_rng(1)
+    instant = np.full(SHAPE, 0.1, np.float32)
+    values = 0.5 * np.exp(rng.normal(0.0, 0.01, 400))
+    values[:80] = rng.uniform(0.1, 0.3, 80)
+    values[80:140] = rng.uniform(0.7, 2.0, 60)
+    instant[REGION] = values
+    common = commonest(instant, REGION)
+    assert np.exp(common) == pytest.approx(0.5, rel=0.02)
+    depth = region_depth(instant, REGION, common)
+    np.testing.assert_allclose(depth[140:], values[140:], rtol=1e-5)
+    np.testing.assert_allclose(depth[:140], 0.5, rtol=0.02)
+
+
+@pytest.mark.parametrize("value", [0.01, 0.3, 0.5, 1.0, 7.3])
+def test_a_region_of_one_depth_has_that(value: float) -> None:
+    assert np.exp(commonest(np.full(SHAPE, value, np.float32), REGION)) == pytest.approx(value)
+
+
+def textured(seed: int = 0) -> Float32:
+    noise = np.random.default_rng(seed).uniform(0.0, 255.0, SHAPE).astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.6), np.float32)
+
+
+def beside(grey: Float32, shift: int) -> InstantView:
+    """A camera that sees what is 2 m away ``shift`` px farther to the left."""
+    jTi = np.eye(4)
+    jTi[0, 3] = -shift * 2.0 / 70.0
+    return InstantView(np.roll(grey, -shift, axis=1), INTRINSICS, jTi)
+
+
+def test_the_right_depth_is_supported_and_a_wrong_one_is_not() -> None:
+    grey = textured()
+    views = [beside(grey, 8)]
+    right, wrong = (support(grey, REGION, np.log(1.0 / depth), RAYS, views) for depth in (2.0, 4.0))
+    assert right == 1.0
+    assert wrong < 0.3
+
+
+def test_what_another_camera_does_not_see_is_not_supported() -> None:
+    grey = textured()
+    assert support(grey, REGION, np.log(0.5), RAYS, [beside(grey, 70)]) == 0.0
+    assert support(grey, REGION, np.log(0.5), RAYS, []) == 0.0
+
+
+def test_regions_that_overlap_are_one_thing() -> None:
+    before, now = np.zeros(SHAPE, np.int32), np.zeros(SHAPE, np.int32)
+    before[10:20, 10:20], before[40:50, 10:20] = 1, 2
+    now[10:20, 14:24], now[40:50, 19:40] = 2, 1
+    assert link(before, now) == [(1, 2)]
+    assert link(before, np.zeros(SHAPE, np.int32)) == []
+
+
+def walk(count: int, wrong: dict[int, float], evidence: dict[int, float]) -> list[RegionDepth]:
+    """A thing that walks away slowly, seen wrongly at some times."""
+    return [RegionDepth((0, t), 1, wrong.get(t, -0.01 * t), evidence.get(t, 1.0)) for t in range(count)]
+
+
+def chain(count: int) -> list[tuple[int, int]]:
+    return [(t, t + 1) for t in range(count - 1)]
+
+
+def test_a_wrong_instant_gives_way_to_those_around() -> None:
+    regions = walk(20, {9: -1.2}, {})
+    solved, belief = smooth_over_time(regions, chain(20))
+    np.testing.assert_allclose(solved, -0.01 * np.arange(20), atol=0.03)
+    assert (belief > 0.5).all()
+
+
+def test_frames_without_evidence_take_it_from_the_nearest_with() -> None:
+    unseen = {t: 0.0 for t in range(8)}
+    regions = walk(20, {t: 1.0 for t in range(8)}, unseen)
+    solved, belief = smooth_over_time(regions, chain(20))
+    np.testing.assert_allclose(solved[:8], -0.08, atol=0.05)
+    assert (np.diff(belief[:8]) > 0.0).all()
+
+
+def test_regions_apart_do_not_touch_each_other() -> None:
+    regions = walk(3, {}, {}) + [RegionDepth((1, t), 1, 2.0, 0.0) for t in range(3)]
+    solved, belief = smooth_over_time(regions, [(0, 1), (1, 2), (3, 4), (4, 5)])
+    np.testing.assert_allclose(solved[3:], 2.0)
+    assert (belief[3:] == 0.0).all()
+    assert (belief[:3] > 0.5).all()
+
+
+def test_a_single_region_keeps_its_depth() -> None:
+    solved, belief = smooth_over_time([RegionDepth((0, 0), 1, -0.7, 0.5)], [])
+    np.testing.assert_allclose(solved, [-0.7])
+    np.testing.assert_allclose(belief, [0.5])
