@@ -29,6 +29,7 @@ start here:
   mvdyn demo                                     the bundled clip, end to end, scored
   mvdyn reconstruct CAPTURE --out OUT            your own capture
   mvdyn export OUT --format nerfstudio           for other tools
+  mvdyn batch FOLDER --out OUT                   every capture of a folder
   mvdyn VERB --help                              every verb explains itself
 
 exit codes: 0 done, 1 failed (one line says why), 2 wrong command line, 3 a bug, 130 interrupted"""

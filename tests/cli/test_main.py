@@ -97,7 +97,7 @@ def test_help_teaches_and_is_fast() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert last_line(done.stdout) == "[] 0"
-    for verb in ("reconstruct", "evaluate", "compare", "export", "demo", "config"):
+    for verb in ("reconstruct", "batch", "evaluate", "compare", "export", "demo", "scene", "config"):
         assert f"    {verb}" in done.stdout
 
 
