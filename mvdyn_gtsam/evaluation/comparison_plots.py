@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvdyn_gtsam.errors import EvaluationError
 from mvdyn_gtsam.evaluation.association import CameraMatch, PoseSource, associate
 from mvdyn_gtsam.evaluation.groundtruth import GroundTruth
+from mvdyn_gtsam.evaluation.plots import panels_of, save_figure
 from mvdyn_gtsam.evaluation.trajectory import TrajectoryErrors, trajectory_errors
 
 _Errors = Mapping[str, tuple[Mapping[str, CameraMatch], TrajectoryErrors]]
@@ -30,15 +29,15 @@ def save_comparison_plots(
     matches = {name: associate(source, groundtruth) for name, source in methods.items()}
     errors = {name: (found, trajectory_errors(found.values())) for name, found in matches.items()}
     return [
-        _save(trajectories_figure(errors), folder / "trajectories.png"),
-        _save(errors_figure(errors), folder / "error.png"),
+        save_figure(trajectories_figure(errors), folder / "trajectories.png"),
+        save_figure(errors_figure(errors), folder / "error.png"),
     ]
 
 
 def trajectories_figure(errors: _Errors) -> Any:
     """The figure of ``trajectories.png``."""
     cameras = _cameras(errors)
-    figure, panels = _figure(1, len(cameras), (5.0 * len(cameras), 4.8))
+    figure, panels = panels_of(1, len(cameras), (5.0 * len(cameras), 4.8))
     for axes, camera in zip(panels[0], cameras, strict=True):
         for index, (method, (matches, found)) in enumerate(errors.items()):
             truth = matches[camera].truth[:, :3, 3]
@@ -58,7 +57,7 @@ def trajectories_figure(errors: _Errors) -> Any:
 def errors_figure(errors: _Errors) -> Any:
     """The figure of ``error.png``."""
     cameras = _cameras(errors)
-    figure, panels = _figure(len(cameras), 1, (9.0, 1.0 + 2.4 * len(cameras)))
+    figure, panels = panels_of(len(cameras), 1, (9.0, 1.0 + 2.4 * len(cameras)))
     for axes, camera in zip(panels[:, 0], cameras, strict=True):
         for index, (method, (matches, found)) in enumerate(errors.items()):
             times, error = matches[camera].timestamps, found.position_m[camera]
@@ -78,22 +77,3 @@ def errors_figure(errors: _Errors) -> Any:
 def _cameras(errors: _Errors) -> list[str]:
     """Every camera of the ground truth; all methods have the same."""
     return list(next(iter(errors.values()))[0])
-
-
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    try:
-        # The figure without pyplot: no window system, no global state.
-        figure_module = importlib.import_module("matplotlib.figure")
-    except ImportError as error:
-        raise EvaluationError("plots need matplotlib: pip install mvdyn_gtsam[eval]") from error
-    figure = figure_module.Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
-
-
-def _save(figure: Any, path: Path) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=120)
-    except OSError as error:
-        raise EvaluationError(f"{path}: plot cannot be written ({error.strerror})") from error
-    return path

@@ -30,8 +30,8 @@ def save_plots(reconstruction: ReconstructionLike, groundtruth: GroundTruth, fol
     matches = associate(reconstruction, groundtruth)
     errors = trajectory_errors(matches.values())
     paths = [
-        _save(_trajectory_figure(matches, errors), folder / "trajectories.png"),
-        _save(_error_figure(matches, errors), folder / "error.png"),
+        save_figure(_trajectory_figure(matches, errors), folder / "trajectories.png"),
+        save_figure(_error_figure(matches, errors), folder / "error.png"),
     ]
     for camera, match in matches.items():
         both = [
@@ -63,28 +63,31 @@ def save_depth_plot(
     Each after its own scale and offset, as Abs.Rel is taken; white where there is no true or no estimated
     depth. Raises EvaluationError when matplotlib is missing or ``path`` cannot be written.
     """
-    figure, row = _figure(1, len(times), (1.0 + 4.5 * len(times), 4.0))
-    for axes, time in zip(np.atleast_1d(row), times, strict=True):
+    figure, panels = panels_of(1, len(times), (1.0 + 4.5 * len(times), 4.0))
+    for axes, time in zip(panels[0], times, strict=True):
         error = frame_depth_error(reconstruction, groundtruth, camera, time)
         shown = axes.imshow(error, vmin=0.0, vmax=WORST_SHOWN, cmap="magma")
         mean = f"{np.nanmean(error):.3f}" if np.isfinite(error).any() else "-"
         axes.set_title(f"{camera} frame {time}: Abs.Rel {mean}")
         axes.set_axis_off()
-    figure.colorbar(shown, ax=row, label="relative depth error", extend="max")
-    return _save(figure, path)
+    figure.colorbar(shown, ax=panels, label="relative depth error", extend="max")
+    return save_figure(figure, path)
 
 
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
+def panels_of(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
+    """A figure of ``size`` inches and its panels ``(rows, columns)``. Raises EvaluationError without
+    matplotlib."""
     try:
         # The figure without pyplot: no window system, no global state.
         figure_module = importlib.import_module("matplotlib.figure")
     except ImportError as error:
         raise EvaluationError("plots need matplotlib: pip install mvdyn_gtsam[eval]") from error
     figure = figure_module.Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(rows, columns)
+    return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _save(figure: Any, path: Path) -> Path:
+def save_figure(figure: Any, path: Path) -> Path:
+    """Write ``figure``. Raises EvaluationError where that fails."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=120)
@@ -94,7 +97,8 @@ def _save(figure: Any, path: Path) -> Path:
 
 
 def _trajectory_figure(matches: Mapping[str, CameraMatch], errors: TrajectoryErrors) -> Any:
-    figure, both = _figure(1, 2, (11.0, 5.0))
+    figure, panels = panels_of(1, 2, (11.0, 5.0))
+    both = panels[0]
     for axes, (horizontal, vertical) in zip(both, ((0, 1), (0, 2)), strict=True):
         for index, match in enumerate(matches.values()):
             color = f"C{index % 10}"
@@ -111,7 +115,8 @@ def _trajectory_figure(matches: Mapping[str, CameraMatch], errors: TrajectoryErr
 
 
 def _error_figure(matches: Mapping[str, CameraMatch], errors: TrajectoryErrors) -> Any:
-    figure, axes = _figure(1, 1, (9.0, 4.0))
+    figure, panels = panels_of(1, 1, (9.0, 4.0))
+    axes = panels[0, 0]
     for index, match in enumerate(matches.values()):
         axes.plot(
             match.timestamps, errors.position_m[match.camera], color=f"C{index % 10}", label=match.camera

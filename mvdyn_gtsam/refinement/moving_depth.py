@@ -20,6 +20,7 @@ from scipy.sparse.linalg import spsolve
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.views import pixels_seen
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -98,12 +99,10 @@ def support(
     Mean correlation of its patches with the view that agrees best; what the view does not see counts as no
     correlation. ``rays (h w, 3)`` has z = 1.
     """
-    best = 0.0
+    best, inverse_depth = 0.0, np.full(len(rays), np.exp(log_inverse_depth), np.float32)
     for view in views:
-        point = rays @ view.jTi[:3, :3].T + np.exp(log_inverse_depth) * view.jTi[:3, 3]
-        front = point[:, 2] > 1e-6
-        pixel = (point / np.where(front, point[:, 2], 1.0)[:, None]) @ view.intrinsics.T
-        at = pixel[:, :2].astype(np.float32).reshape(*grey.shape, 2)
+        pixels, front = pixels_seen(inverse_depth, rays, view.jTi, view.intrinsics)
+        at = pixels.reshape(*grey.shape, 2)
         warped = cv2.remap(
             view.grey, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1e3
         )

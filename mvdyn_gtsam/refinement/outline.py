@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.views import pixels_seen
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -48,11 +49,7 @@ def background(
     """
     seen = np.full((len(others), len(rays)), np.nan, np.float32)
     for row, other in zip(seen, others, strict=True):
-        # scaled by the inverse depth: finite at infinity
-        point = rays @ other.jTi[:3, :3].T + inverse_depth[:, None] * other.jTi[:3, 3]
-        front = point[:, 2] > 1e-6
-        pixel = (point / np.where(front, point[:, 2], 1.0)[:, None]) @ intrinsics.T
-        at = [np.ascontiguousarray(pixel[None, :, axis], dtype=np.float32) for axis in (0, 1)]
+        at, front = pixels_seen(inverse_depth, rays, other.jTi, intrinsics)
         value = _sampled(other.grey, at, NOTHING)
         free = front & (value > 0.5 * NOTHING) & (_sampled(other.moves.astype(np.float32), at, 1.0) < 0.1)
         row[free] = value[free]
@@ -82,9 +79,9 @@ def outlined(mask: Mask, around: Mask, grey: Float32, behind: Float32, config: R
     return np.asarray((cv2.morphologyEx(moves, cv2.MORPH_CLOSE, kernel) > 0) & around)
 
 
-def _sampled(image: Float32, at: Sequence[Float32], outside: float) -> Float32:
-    """``(M,)`` of ``image (h, w)`` at columns and rows ``(1, M)``."""
+def _sampled(image: Float32, at: Float32, outside: float) -> Float32:
+    """``(M,)`` of ``image (h, w)`` at pixels ``(M, 2)``."""
     value = cv2.remap(
-        image, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
+        image, at[None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
     )
     return np.asarray(value[0], np.float32)

@@ -58,3 +58,17 @@ def scaled_intrinsics(intrinsics: Array, scale_x: float, scale_y: float) -> Arra
     scaled[0, 2] = (intrinsics[0, 2] + 0.5) * scale_x - 0.5
     scaled[1, 2] = (intrinsics[1, 2] + 0.5) * scale_y - 0.5
     return scaled
+
+
+def pixels_seen(
+    inverse_depth: Float32, rays: Float32, jTi: Array, intrinsics_j: Array
+) -> tuple[Float32, npt.NDArray[np.bool_]]:
+    """Pixels ``(M, 2)`` of view j of points at ``inverse_depth (M,)`` along ``rays (M, 3)`` of view i.
+
+    Also ``(M,)`` whether they are in front of it. Points are scaled by their inverse depth, so that those at
+    infinity are finite.
+    """
+    point = rays @ jTi[:3, :3].T + inverse_depth[:, None] * jTi[:3, 3]
+    front = point[:, 2] > 1e-6
+    pixel = (point / np.where(front, point[:, 2], 1.0)[:, None]) @ intrinsics_j.T
+    return pixel[:, :2].astype(np.float32), front

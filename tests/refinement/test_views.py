@@ -7,11 +7,12 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.geometry import pixel_rays, project
 from mvdyn_gtsam.refinement.tasks import upsample
-from mvdyn_gtsam.refinement.views import DenseView, scaled_intrinsics
+from mvdyn_gtsam.refinement.views import DenseView, pixels_seen, scaled_intrinsics
 
 Array = npt.NDArray[np.float64]
 
@@ -129,3 +130,20 @@ def test_depth_changes_where_the_image_does(column: int) -> None:
     # one on each side, whose luminance is itself between the two
     assert wrong[24].sum() <= 2 < wrong_linear.sum()
     assert found.min() >= 0.2 * (1.0 - 1e-5) and found.max() <= 0.5 * (1.0 + 1e-5)
+
+
+def test_pixels_seen_are_those_of_the_points() -> None:
+    rng = np.random.default_rng(0)
+    view = DenseView.of(Camera("cam0", 64, 48, 50.0, 55.0, 31.5, 23.5), 0.5)
+    rays = view.rays[rng.integers(0, len(view.rays), 20)]
+    depth = rng.uniform(1.0, 5.0, 20).astype(np.float32)
+    jTi = np.eye(4)
+    jTi[:3, :3] = Rotation.from_rotvec([0.05, -0.1, 0.02]).as_matrix()
+    jTi[:3, 3] = [0.3, -0.1, 0.2]
+    pixels, front = pixels_seen(1.0 / depth, rays, jTi, view.intrinsics)
+    points = (rays * depth[:, None]) @ jTi[:3, :3].T + jTi[:3, 3]
+    expected = points @ view.intrinsics.T
+    np.testing.assert_allclose(pixels, expected[:, :2] / expected[:, 2:], rtol=1e-4, atol=1e-3)
+    assert front.all()
+    jTi[2, 3] = -10.0
+    assert not pixels_seen(1.0 / depth, rays, jTi, view.intrinsics)[1].any()
