@@ -9,7 +9,6 @@ bundle adjustment has the last word.
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -37,6 +36,7 @@ from mvdyn_gtsam.frontend.single_camera import CameraMap, build_camera_map, choo
 from mvdyn_gtsam.frontend.start import Start, StartFrame
 from mvdyn_gtsam.frontend.still_cameras import SamePoint, StillConfig, place_still_cameras
 from mvdyn_gtsam.frontend.still_view import StillView, build_still_view, frames_of_view, lone_frames
+from mvdyn_gtsam.frontend.threads import flow_threads
 from mvdyn_gtsam.frontend.verification import Verdict, VerificationConfig, verify_placement
 from mvdyn_gtsam.geometry import Similarity
 from mvdyn_gtsam.progress import NullProgress, Progress
@@ -183,7 +183,7 @@ class ClassicalInitializer:
         maps: list[CameraMap] = []
         dense: dict[int, DenseMap] = {}
         # any other flow than one that may be called from several threads gets one caller
-        workers = os.cpu_count() if isinstance(self.flow, OneWayFlow) else 1
+        workers = flow_threads() if isinstance(self.flow, OneWayFlow) else 1
         with ThreadPoolExecutor(workers) as pool:
             try:
                 for camera, (own, own_dense) in enumerate(pool.map(partial(self._map, capture), cameras)):

@@ -18,8 +18,12 @@ from mvdyn_gtsam.tracking.model import Keyframe, View
 from mvdyn_gtsam.tracking.polish import NO_MOUNTS, Mounts, build_graph
 from mvdyn_gtsam.tracking.window import Priors
 
-LARGEST_INVERSE = 3000
-"""Unknowns up to which one dense inverse is faster than marginals from the Bayes tree; 72 MB."""
+LARGEST_INVERSE = 1000
+"""Unknowns up to which a dense inverse is taken, four matrices of 8 MB."""
+FACTORS_AT_ONCE = 100
+"""Factors whose blocks are held before they are summed."""
+BLOCKS_AT_ONCE = 15
+"""Blocks of the inverse solved for at once."""
 
 
 def marginal_covariances(
@@ -30,58 +34,60 @@ def marginal_covariances(
     mounts: Mounts = NO_MOUNTS,
 ) -> dict[Frame, npt.NDArray[np.float64]]:
     """``(6, 6)`` covariance of every keyframe's pose, tangent ``[omega, v]``."""
-    graph, values = build_graph(keyframes, views, config, priors, mounts=mounts)
-    ordering = gtsam.Ordering()
-    for keyframe in keyframes:
-        ordering.push_back(X(*keyframe.frame))
-        ordering.push_back(S(*keyframe.frame))
-    for pair in mounts:
-        ordering.push_back(M(*pair))
-    linear = graph.linearize(values)
+    graph, values = build_graph(keyframes, views, config, priors, mounts=mounts, room=0)
+    keys = [key(*keyframe.frame) for keyframe in keyframes for key in (X, S)] + [M(*pair) for pair in mounts]
+    information = _sparse_information(graph, values, keys)
+    # unit diagonal: the gauge is held a million times as firmly as the rest
+    scale = 1.0 / np.sqrt(information.diagonal())
+    information.data *= scale[information.indices] * np.repeat(scale, np.diff(information.indptr))
     rows = [np.arange(7 * row, 7 * row + 6) for row in range(len(keyframes))]
-    if 7 * len(keyframes) > LARGEST_INVERSE:
-        blocks = _inverse_blocks(_sparse_information(linear, ordering, values), rows)
+    if len(scale) > LARGEST_INVERSE:
+        blocks = _inverse_blocks(information, scale, rows)
     else:
-        information, _ = linear.hessian(ordering)
-        # unit diagonal: the gauge is held a million times as firmly as the rest
-        scale = 1.0 / np.sqrt(np.diagonal(information))
-        factor = cho_factor(information * scale[:, None] * scale)
-        covariance = scale[:, None] * cho_solve(factor, np.diag(scale))
+        factor = cho_factor(information.toarray(), overwrite_a=True)
+        covariance = scale[:, None] * cho_solve(factor, np.diag(scale), overwrite_b=True)
         blocks = [covariance[np.ix_(row, row)] for row in rows]
     return {keyframe.frame: block for keyframe, block in zip(keyframes, blocks, strict=True)}
 
 
 def _sparse_information(
-    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, values: gtsam.Values
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Sequence[int]
 ) -> sparse.csc_array:
-    """The information matrix in the order of ``ordering``, of the factors' own blocks."""
-    keys = [ordering.at(k) for k in range(ordering.size())]
+    """The information matrix in the order of ``keys``, of the factors' own blocks.
+
+    Factors are linearised a few at a time: all blocks at once would be the largest thing in memory.
+    """
     zeros = values.zeroVectors()
     sizes = [len(zeros.at(key)) for key in keys]
-    first = dict(zip(keys, np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(int), strict=True))
-    size_of = dict(zip(keys, sizes, strict=True))
-    parts: list[tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.int64]]] = []
-    for k in range(linear.size()):
-        factor = linear.at(k)
-        index = np.concatenate([first[key] + np.arange(size_of[key]) for key in factor.keys()])
-        block = factor.information()
-        parts.append((block.ravel(), np.repeat(index, len(index)), np.tile(index, len(index))))
-    data, rows, cols = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return sparse.csc_array(sparse.coo_array((data, (rows, cols)), shape=(sum(sizes), sum(sizes))))
+    first = dict(zip(keys, np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int32), strict=True))
+    spans = {key: first[key] + np.arange(size, dtype=np.int32) for key, size in zip(keys, sizes, strict=True)}
+    shape = (sum(sizes), sum(sizes))
+    total = sparse.csc_array(shape)
+    for start in range(0, graph.size(), FACTORS_AT_ONCE):
+        parts = []
+        for k in range(start, min(start + FACTORS_AT_ONCE, graph.size())):
+            factor = graph.at(k).linearize(values)
+            index = np.concatenate([spans[key] for key in factor.keys()])
+            parts.append(
+                (factor.information().ravel(), np.repeat(index, len(index)), np.tile(index, len(index)))
+            )
+        data, rows, cols = (np.concatenate(part) for part in zip(*parts, strict=True))
+        total += sparse.csc_array(sparse.coo_array((data, (rows, cols)), shape=shape))
+    return total
 
 
 def _inverse_blocks(
-    information: sparse.csc_array, rows: Sequence[npt.NDArray[np.int64]], at_once: int = 30
+    information: sparse.csc_array, scale: npt.NDArray[np.float64], rows: Sequence[npt.NDArray[np.int64]]
 ) -> list[npt.NDArray[np.float64]]:
-    """Diagonal blocks ``rows`` of the inverse, some columns at a time: never the whole of it in memory."""
-    # unit diagonal, as above
-    scale = 1.0 / np.sqrt(information.diagonal())
-    scaling = sparse.diags_array(scale)
-    solver = splu(sparse.csc_matrix(scaling @ information @ scaling), "MMD_AT_PLUS_A", 0.0,
+    """Diagonal blocks ``rows`` of the inverse, some columns at a time: never the whole of it in memory.
+
+    ``information`` has been multiplied by ``scale`` on both sides.
+    """
+    solver = splu(sparse.csc_matrix(information), "MMD_AT_PLUS_A", 0.0,
                   options={"SymmetricMode": True})  # fmt: skip
     blocks = []
-    for start in range(0, len(rows), at_once):
-        chosen = rows[start : start + at_once]
+    for start in range(0, len(rows), BLOCKS_AT_ONCE):
+        chosen = rows[start : start + BLOCKS_AT_ONCE]
         columns = np.concatenate(chosen)
         unit = np.zeros((len(scale), len(columns)))
         unit[columns, np.arange(len(columns))] = scale[columns]

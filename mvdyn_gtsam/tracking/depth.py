@@ -8,9 +8,9 @@ import numpy.typing as npt
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import distance_transform_edt, median_filter
 
-from mvdyn_gtsam.frontend.dense_flow import GridFlow
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.geometry import backproject, invert_pose, transform_points
+from mvdyn_gtsam.tracking.kept_flow import KeptFlow
 
 Array = npt.NDArray[np.float64]
 
@@ -29,7 +29,7 @@ def sparse_log_depth(pixels: Array, depth: Array, grid: Grid) -> Array:
 
 
 def carried_log_depth(
-    flow_to_source: GridFlow,
+    flow_to_source: KeptFlow,
     grid: Grid,
     wTc: Array,
     source_grid: Grid,
@@ -44,7 +44,7 @@ def carried_log_depth(
     ``source_intrinsics (3, 3)``. Points with a weight below ``minimum_weight`` take the nearest carried
     depth. With nothing carried, everything is filled with the source's median.
     """
-    target = flow_to_source.target.astype(np.float32)
+    target = flow_to_source.target
     raster = (target - source_grid.pixels[0].astype(np.float32)) / np.float32(source_grid.stride)
     table = source_log_depth.reshape(source_grid.shape).astype(np.float32)
     there = cv2.remap(

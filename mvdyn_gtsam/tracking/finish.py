@@ -59,6 +59,8 @@ def polish(state: TrackState, on_progress: OnProgress | None = None) -> None:
             state.count_time("polish measure", began)
         began = perf_counter()
         last = polish_round == state.tracking.polish_rounds
+        if last:
+            _make_room(state)
         # the first solve starts from the window's poses, with errors that a narrow loss would not see
         robust_px = state.tracking.window_robust_px if polish_round == 0 else state.tracking.robust_px
         solve_all(
@@ -140,6 +142,13 @@ def _remeasure(state: TrackState, on_progress: OnProgress | None) -> None:
                 yield first, second
 
     state.measurer.guided_all(due())
+
+
+def _make_room(state: TrackState) -> None:
+    """Free what only further measuring would need: the last solve and the covariances need the memory."""
+    state.images.make_room()
+    for keyframe in state.keyframes:
+        keyframe.guides.clear()
 
 
 def _time_first(frame: Frame) -> tuple[int, int]:
@@ -235,7 +244,7 @@ def _records(state: TrackState) -> tuple[EdgeRecord, ...]:
                     i=keyframe.frame,
                     j=frame,
                     kind=state.kinds[frozenset((keyframe.frame, frame))],
-                    weight=float(keyframe.flows[frame].weight.mean()),
+                    weight=keyframe.flows[frame].mean_weight,
                     median_px=float(residuals.median_px[index]),
                     inlier_fraction=float(residuals.inlier_fraction[index]),
                 )

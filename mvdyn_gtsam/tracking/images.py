@@ -14,9 +14,13 @@ from mvdyn_gtsam.graph.connections import Frame
 Image = npt.NDArray[np.uint8]
 Read = Callable[[int, int], Image]
 
+MOST_FRAMES = 256
+"""Frames held at most, however small: those further back are seldom needed and quickly decoded again."""
+
 
 class ImageStore:
-    """Images by frame, the ones used least recently dropped beyond ``capacity_bytes``.
+    """Images by frame, the ones used least recently dropped beyond ``capacity_bytes`` or
+    ``MOST_FRAMES``.
 
     With ``grey`` only their luminance ``(H, W)`` is kept and handed out.
     """
@@ -35,7 +39,7 @@ class ImageStore:
             image = to_grey(image)
         self._images[frame] = image
         self._bytes += image.nbytes
-        while self._bytes > self._capacity and len(self._images) > 1:
+        while len(self._images) > 1 and (self._bytes > self._capacity or len(self._images) > MOST_FRAMES):
             _, dropped = self._images.popitem(last=False)
             self._bytes -= dropped.nbytes
 
@@ -43,6 +47,12 @@ class ImageStore:
         image = self._images.pop(frame, None)
         if image is not None:
             self._bytes -= image.nbytes
+
+    def make_room(self) -> None:
+        """Drop every image that can be read again."""
+        if self.read is not None:
+            self._images.clear()
+            self._bytes = 0
 
     def available(self, frame: Frame) -> bool:
         """Whether ``get`` can deliver."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,15 +17,19 @@ from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, GridFlow, sam
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.frontend.grid_flow import GridView, OneWayFlow, guide_grid, measure_grid
 from mvdyn_gtsam.frontend.guided_flow import guided_flow
+from mvdyn_gtsam.frontend.threads import flow_threads
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.tracking.depth import smoothed_log_depth
 from mvdyn_gtsam.tracking.images import ImageStore
+from mvdyn_gtsam.tracking.kept_flow import KeptFlow
 from mvdyn_gtsam.tracking.model import Guide, Keyframe, View
 
 Array = npt.NDArray[np.float64]
 GridFlows = tuple[GridFlow, GridFlow]
 """i -> j at the grid of i, and j -> i at that of j."""
+SMOOTH_DEPTHS = 200
+"""Smooth depths kept, of the frames measured last."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class EdgeMeasurer:
         self._views, self._flow, self._flow_config = views, flow, flow_config
         self._images, self._config = images, config
         self._smooth: OrderedDict[int, tuple[Array, Array]] = OrderedDict()
-        self._workers = (os.cpu_count() or 1) if isinstance(flow, OneWayFlow) else 1
+        self._workers = flow_threads() if isinstance(flow, OneWayFlow) else 1
         self._pool = ThreadPoolExecutor(self._workers) if self._workers > 1 else None
 
     def temporal(self, i: Keyframe, j: Keyframe) -> None:
@@ -98,12 +101,16 @@ class EdgeMeasurer:
 
     def _store(self, job: _Job, flows: GridFlows) -> None:
         i, j = job.i, job.j
-        i.flows[j.frame], j.flows[i.frame] = flows
+        i.flows[j.frame], j.flows[i.frame] = self._kept(flows[0], j), self._kept(flows[1], i)
         if job.guides is None:
             i.guides.pop(j.frame, None)
             j.guides.pop(i.frame, None)
         else:
             i.guides[j.frame], j.guides[i.frame] = job.guides
+
+    def _kept(self, flow: GridFlow, into: Keyframe) -> KeptFlow:
+        camera = self._views[into.camera].camera
+        return KeptFlow.of(flow, camera.width, camera.height)
 
     def _plain_job(self, i: Keyframe, j: Keyframe) -> _Job:
         grid_i, grid_j = self._views[i.camera].grid, self._views[j.camera].grid
@@ -130,7 +137,7 @@ class EdgeMeasurer:
     def _change(self, i: Keyframe, j: Keyframe) -> float:
         guide = i.guides[j.frame]
         view_i, intrinsics = self._views[i.camera], self._views[j.camera].intrinsics[None]
-        used = i.flows[j.frame].weight > 0.0
+        used = i.flows[j.frame].weight_steps > 0
         if not used.any():
             used = np.ones_like(used)
         identity = np.eye(4)
@@ -166,7 +173,7 @@ class EdgeMeasurer:
         else:
             depth = np.exp(smoothed_log_depth(keyframe.log_depth, keyframe.information, view.grid))
             self._smooth[id(keyframe)] = (keyframe.log_depth, depth)
-            while len(self._smooth) > 1000:
+            while len(self._smooth) > SMOOTH_DEPTHS:
                 self._smooth.popitem(last=False)
         size = view.camera.width, view.camera.height
         return GridView(view.grid, size, view.camera.intrinsics, depth)

@@ -12,11 +12,11 @@ import numpy.typing as npt
 from factors.measurement import StructurelessMeasurement
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.config import TrackingConfig
-from mvdyn_gtsam.frontend.dense_flow import GridFlow
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.geometry import pixel_rays
 from mvdyn_gtsam.graph.connections import EdgeCounts, EdgeKind, Frame
 from mvdyn_gtsam.tracking.fixed_shape import FixedShapeMeasurement
+from mvdyn_gtsam.tracking.kept_flow import KeptFlow
 
 Array = npt.NDArray[np.float64]
 
@@ -72,7 +72,7 @@ class Keyframe:
     prior_sigma: Array
     """``(N,)``"""
     log_scale: float = 0.0
-    flows: dict[Frame, GridFlow] = field(default_factory=dict)
+    flows: dict[Frame, KeptFlow] = field(default_factory=dict)
     """Flow from this frame to others."""
     guides: dict[Frame, Guide] = field(default_factory=dict)
     """What the flow to a neighbour was guided by; neighbours measured without guidance have no entry."""

@@ -166,11 +166,14 @@ def build_graph(
     thin: bool = False,
     robust_px: float | None = None,
     mounts: Mounts = NO_MOUNTS,
+    room: int = KEPT_BYTES,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """One structureless factor per keyframe over all it was measured against, the priors and the mounts."""
+    """One structureless factor per keyframe over all it was measured against, the priors and the mounts.
+
+    Measurements are kept within ``room`` bytes.
+    """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     members = {keyframe.frame for keyframe in keyframes}
-    room = KEPT_BYTES
     for keyframe in keyframes:
         values.insert(X(*keyframe.frame), gtsam.Pose3(keyframe.wTc))
         values.insert(S(*keyframe.frame), keyframe.log_scale)

@@ -215,6 +215,7 @@ class Tracker:
         if self.state.last_time < 0:
             raise TrackingError("nothing was tracked: step was never called")
         self._finish_last_frames()
+        self._window.release()
         return end.finish(self.state, on_progress)
 
     def frame_depths(self) -> Iterator[FrameDepth]:

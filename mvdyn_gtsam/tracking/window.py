@@ -24,7 +24,7 @@ MINIMUM_WEIGHT = 0.01
 
 def useful_neighbours(keyframe: Keyframe) -> list[Frame]:
     """Frames that the keyframe has a flow of any weight to, in a fixed order."""
-    return [frame for frame, flow in sorted(keyframe.flows.items()) if flow.weight.mean() > MINIMUM_WEIGHT]
+    return [frame for frame, flow in sorted(keyframe.flows.items()) if flow.mean_weight > MINIMUM_WEIGHT]
 
 
 class SlidingWindow:
@@ -58,6 +58,12 @@ class SlidingWindow:
             self._members[keyframe.frame] = keyframe
         renewed = [keyframe for keyframe in touched if keyframe.frame in self._members]
         self._solve(new, renewed, all_frames)
+
+    def release(self) -> None:
+        """Give the tree's memory back: tracking is over."""
+        self._isam = _make_isam()
+        self._members.clear()
+        self._index.clear()
 
     def _rebuild(self, all_frames: dict[Frame, Keyframe]) -> None:
         self._isam = _make_isam()
