@@ -46,10 +46,19 @@ class Context:
     def image(self, name: str, frame: Frame) -> Float32:
         return np.asarray(self.workspace.read(name, frame), np.float32)
 
-    def edges(self, frame: Frame, wTc: Array, own_camera: bool) -> list[Edge]:
-        """Measured edges of a frame; with ``own_camera`` those within its camera."""
+    def edges(
+        self, frame: Frame, wTc: Array, own_camera: bool, among: npt.NDArray[np.int64] | None = None
+    ) -> list[Edge]:
+        """Measured edges of a frame, at pixels ``among`` or all; ``own_camera``: only within its camera."""
         wanted = [j for j in self.neighbours.get(frame, ()) if not own_camera or j[0] == frame[0]]
-        return load_edges(self.workspace, frame, wanted, wTc)
+        return load_edges(self.workspace, frame, wanted, wTc, among)
+
+    def raster(self, frame: Frame, spacing: float) -> npt.NDArray[np.int64]:
+        """Flat indices, ascending, of a frame's pixels ``spacing`` px of the input apart."""
+        view = self.workspace.views[frame[0]]
+        step = max(1, round(spacing * view.shape[1] / view.camera.width))
+        pixels = np.arange(view.shape[0] * view.shape[1]).reshape(view.shape)
+        return pixels[step // 2 :: step, step // 2 :: step].ravel()
 
     def luminance(self, frame: Frame) -> Float32:
         """``(h, w)`` without the noise of single pixels."""

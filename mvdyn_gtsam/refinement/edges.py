@@ -64,9 +64,19 @@ class Edge:
         )
 
 
-def load_edges(workspace: Workspace, i: Frame, neighbours: Iterable[Frame], wTc: Array) -> list[Edge]:
-    """Edges of a frame to those of ``neighbours`` whose flow was measured; ``wTc (N, T, 4, 4)``."""
+def load_edges(
+    workspace: Workspace,
+    i: Frame,
+    neighbours: Iterable[Frame],
+    wTc: Array,
+    among: npt.NDArray[np.int64] | None = None,
+) -> list[Edge]:
+    """Edges of a frame to those of ``neighbours`` whose flow was measured; ``wTc (N, T, 4, 4)``.
+
+    ``among (P,)`` are flat indices of pixels, in ascending order: only these are looked at.
+    """
     edges = []
+    raster = pixel_raster(workspace.views[i[0]].shape).reshape(-1, 2)
     for j in neighbours:
         first = is_first(i, j)
         if not workspace.has_flow(*((i, j) if first else (j, i))):
@@ -74,8 +84,11 @@ def load_edges(workspace: Workspace, i: Frame, neighbours: Iterable[Frame], wTc:
         measured = workspace.read_flow(i, j) if first else workspace.read_flow(j, i, backward=True)
         view_i, view_j = workspace.views[i[0]], workspace.views[j[0]]
         weight = measured.weight.ravel()
-        pixels = np.flatnonzero(weight >= LEAST_WEIGHT)
-        small = (pixel_raster(view_i.shape) + measured.flow).reshape(-1, 2)[pixels]
+        if among is None:
+            pixels = np.flatnonzero(weight >= LEAST_WEIGHT)
+        else:
+            pixels = among[weight[among] >= LEAST_WEIGHT]
+        small = raster[pixels] + measured.flow.reshape(-1, 2)[pixels]
         edges.append(
             Edge(
                 i=i,

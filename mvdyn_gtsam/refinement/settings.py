@@ -77,7 +77,7 @@ class RefinementConfig:
     """Times phase 2 solves poses, then depth, after a first depth. Source: choice, time."""
     affine_iterations: int = 5
     """Gauss-Newton iterations of phase 1. Source: choice."""
-    edges_per_frame: int = 8
+    edges_per_frame: int = 6
     """Edges of a frame that its depth is solved from, those with most parallax. Source: choice, time; 6 to 10
     came out alike on six frames of robodog_overlap, in a trial that is not kept."""
     depth_iterations: int = 5

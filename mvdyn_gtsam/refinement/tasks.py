@@ -18,7 +18,7 @@ from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import Pair
 from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
 from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
-from mvdyn_gtsam.refinement.edges import Edge
+from mvdyn_gtsam.refinement.edges import Edge, load_edges
 from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
     best_candidate,
@@ -36,6 +36,8 @@ Mask = npt.NDArray[np.bool_]
 
 SAMPLE_SPACING = 16
 """Distance of the pixels that phase 1 and the poses see, px of the input."""
+CHECK_SPACING = 8
+"""Distance of the pixels that choose edges and whose residuals are compared, px of the input."""
 FIRST_STEPS = 2
 """Gauss-Newton steps before it is asked what moves."""
 GUIDE_STEPS = 3
@@ -107,9 +109,10 @@ def window_task(context: Context, window: tuple[str, str, int, int, int]) -> Non
     for group in context.groups:
         for frame in ((camera, time) for time in times for camera in group):
             moves = workspace.read("moving", frame) != STATIC
-            edges = context.edges(frame, wTc, own_camera=False)
+            sparse = context.edges(frame, wTc, own_camera=False, among=context.raster(frame, CHECK_SPACING))
+            telling = most_telling(sparse, context.image(source, frame), config.edges_per_frame)
+            edges = load_edges(workspace, frame, [edge.j for edge in telling], wTc)
             edges = [edge if edge.same_instant else edge.without(moves.ravel()) for edge in edges]
-            edges = most_telling(edges, context.image(source, frame), config.edges_per_frame)
             others = {
                 edge.j: renewed[edge.j] if edge.j in renewed else np.log(context.image(source, edge.j))
                 for edge in edges
@@ -166,14 +169,9 @@ def sample_task(context: Context, job: tuple[str, Frame]) -> FrameSample:
     """A frame's pixels on a coarse raster, with depth of the array named first and flow to all neighbours."""
     depth_name, frame = job
     workspace, wTc = context.workspace, context.poses()
-    view = workspace.views[frame[0]]
-    step = max(1, round(SAMPLE_SPACING * view.shape[1] / view.camera.width))
-    raster = np.arange(view.shape[0] * view.shape[1]).reshape(view.shape)
-    pixels = raster[step // 2 :: step, step // 2 :: step].ravel()
-    row_of = np.full(view.shape[0] * view.shape[1], -1)
-    row_of[pixels] = np.arange(len(pixels))
+    view, pixels = workspace.views[frame[0]], context.raster(frame, SAMPLE_SPACING)
     moves = (workspace.read("moving", frame) != STATIC).ravel()
-    edges = context.edges(frame, wTc, own_camera=False)
+    edges = context.edges(frame, wTc, own_camera=False, among=pixels)
     count = len(edges)
     target = np.zeros((count, len(pixels), 2))
     weight = np.zeros((count, len(pixels)))
@@ -181,11 +179,10 @@ def sample_task(context: Context, job: tuple[str, Frame]) -> FrameSample:
     for k, edge in enumerate(edges):
         if not edge.same_instant:
             edge = edge.without(moves)
-        rows = row_of[edge.pixels]
-        here = rows >= 0
-        target[k, rows[here]] = edge.target[here]
-        weight[k, rows[here]] = edge.weight[here]
-        seen = here & (edge.nearest >= 0)
+        rows = np.searchsorted(pixels, edge.pixels)
+        target[k, rows] = edge.target
+        weight[k, rows] = edge.weight
+        seen = edge.nearest >= 0
         there[k, rows[seen]] = context.image(depth_name, edge.j).ravel()[edge.nearest[seen]]
     return FrameSample(
         i=frame,
@@ -230,9 +227,10 @@ def finish_task(context: Context, job: tuple[str, Frame]) -> FinishedFrame:
     size = (view.camera.width, view.camera.height)
     mask = np.array([0, 255, 128], np.uint8)[moving]
     inverse_depth = context.image(name, frame)
-    edges = context.edges(frame, context.poses(), own_camera=False)
+    checked = context.raster(frame, CHECK_SPACING)
+    edges = context.edges(frame, context.poses(), own_camera=False, among=checked)
     tracked_wTc = context.workspace.read_array("tracked_poses")
-    before = context.edges(frame, tracked_wTc, own_camera=False)
+    before = context.edges(frame, tracked_wTc, own_camera=False, among=checked)
     return FinishedFrame(
         frame=frame,
         depth=1.0 / upsample(inverse_depth, grey, context.config.edge_contrast),
