@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import gtsam
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse.linalg import splu
 
 from factors.keys import M, S, X
 from mvdyn_gtsam.config import TrackingConfig
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.tracking.model import Keyframe, View
+from mvdyn_gtsam.tracking.normal_equations import NormalEquations, factorised, scaled
 from mvdyn_gtsam.tracking.polish import NO_MOUNTS, Mounts, build_graph
 from mvdyn_gtsam.tracking.window import Priors
 
 LARGEST_INVERSE = 1000
 """Unknowns up to which a dense inverse is taken, four matrices of 8 MB."""
-FACTORS_AT_ONCE = 100
-"""Factors whose blocks are held before they are summed."""
 BLOCKS_AT_ONCE = 15
 """Blocks of the inverse solved for at once."""
 
@@ -36,10 +33,10 @@ def marginal_covariances(
     """``(6, 6)`` covariance of every keyframe's pose, tangent ``[omega, v]``."""
     graph, values = build_graph(keyframes, views, config, priors, mounts=mounts, room=0)
     keys = [key(*keyframe.frame) for keyframe in keyframes for key in (X, S)] + [M(*pair) for pair in mounts]
-    information = _sparse_information(graph, values, keys)
+    information = NormalEquations.of(graph, values, keys).information
     # unit diagonal: the gauge is held a million times as firmly as the rest
     scale = 1.0 / np.sqrt(information.diagonal())
-    information.data *= scale[information.indices] * np.repeat(scale, np.diff(information.indptr))
+    information = scaled(information, scale)
     rows = [np.arange(7 * row, 7 * row + 6) for row in range(len(keyframes))]
     if len(scale) > LARGEST_INVERSE:
         blocks = _inverse_blocks(information, scale, rows)
@@ -50,32 +47,6 @@ def marginal_covariances(
     return {keyframe.frame: block for keyframe, block in zip(keyframes, blocks, strict=True)}
 
 
-def _sparse_information(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Sequence[int]
-) -> sparse.csc_array:
-    """The information matrix in the order of ``keys``, of the factors' own blocks.
-
-    Factors are linearised a few at a time: all blocks at once would be the largest thing in memory.
-    """
-    zeros = values.zeroVectors()
-    sizes = [len(zeros.at(key)) for key in keys]
-    first = dict(zip(keys, np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int32), strict=True))
-    spans = {key: first[key] + np.arange(size, dtype=np.int32) for key, size in zip(keys, sizes, strict=True)}
-    shape = (sum(sizes), sum(sizes))
-    total = sparse.csc_array(shape)
-    for start in range(0, graph.size(), FACTORS_AT_ONCE):
-        parts = []
-        for k in range(start, min(start + FACTORS_AT_ONCE, graph.size())):
-            factor = graph.at(k).linearize(values)
-            index = np.concatenate([spans[key] for key in factor.keys()])
-            parts.append(
-                (factor.information().ravel(), np.repeat(index, len(index)), np.tile(index, len(index)))
-            )
-        data, rows, cols = (np.concatenate(part) for part in zip(*parts, strict=True))
-        total += sparse.csc_array(sparse.coo_array((data, (rows, cols)), shape=shape))
-    return total
-
-
 def _inverse_blocks(
     information: sparse.csc_array, scale: npt.NDArray[np.float64], rows: Sequence[npt.NDArray[np.int64]]
 ) -> list[npt.NDArray[np.float64]]:
@@ -83,8 +54,7 @@ def _inverse_blocks(
 
     ``information`` has been multiplied by ``scale`` on both sides.
     """
-    solver = splu(sparse.csc_matrix(information), "MMD_AT_PLUS_A", 0.0,
-                  options={"SymmetricMode": True})  # fmt: skip
+    solver = factorised(information)
     blocks = []
     for start in range(0, len(rows), BLOCKS_AT_ONCE):
         chosen = rows[start : start + BLOCKS_AT_ONCE]

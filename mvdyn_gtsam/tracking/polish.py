@@ -19,6 +19,7 @@ from mvdyn_gtsam.config import TrackingConfig
 from mvdyn_gtsam.frontend.rig import Pair, add_mounts
 from mvdyn_gtsam.tracking.keyframe_factor import keyframe_factor
 from mvdyn_gtsam.tracking.model import Keyframe, View, measurement_of
+from mvdyn_gtsam.tracking.normal_equations import descend
 from mvdyn_gtsam.tracking.window import Priors, solve_depth, useful_neighbours
 
 logger = logging.getLogger(__name__)
@@ -31,12 +32,14 @@ SHORT_RUN = 3
 """Levenberg-Marquardt iterations between two searches along the way."""
 LONGEST_SEARCH = 5
 """Doublings of a search."""
-KEPT_BYTES = 128 * 2**20
+KEPT_BYTES = 64 * 2**20
 """Memory for measurements that are kept between linearisations; those beyond are built each time."""
 BYTES_PER_MEASUREMENT = 40
 """Of one point and edge in double precision: target, weight, information, and what they are made of."""
-METIS_FROM = 800
-"""Variables from which nested dissection orders better than COLAMD."""
+LARGE = 800
+"""Variables from which one sparse matrix is solved faster than GTSAM eliminates them one by one."""
+DAMPING = 1e-6
+"""That Levenberg-Marquardt begins with."""
 
 
 @dataclass(frozen=True)
@@ -93,18 +96,23 @@ def minimise(
     parameters = gtsam.LevenbergMarquardtParams()
     # multifrontal Cholesky calls compressed factors indeterminate where sequential solves them
     parameters.setLinearSolverType("SEQUENTIAL_CHOLESKY")
-    parameters.setOrderingType("METIS" if values.size() > METIS_FROM else "COLAMD")
+    parameters.setOrderingType("COLAMD")
     parameters.setMaxIterations(SHORT_RUN)
     parameters.setRelativeErrorTol(config.polish_tolerance)
     parameters.setAbsoluteErrorTol(0.0)
-    parameters.setlambdaInitial(1e-6)
+    parameters.setlambdaInitial(DAMPING)
     iterations = 0
     while iterations < config.polish_iterations:
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-        reached = optimizer.optimize()
+        if values.size() > LARGE:
+            reached, reached_error = descend(
+                graph, values, error, DAMPING, SHORT_RUN, config.polish_tolerance
+            )
+        else:
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+            reached, reached_error = optimizer.optimize(), optimizer.error()
         iterations += SHORT_RUN
         way = values.localCoordinates(reached)
-        reached, reached_error = _search_on(graph, reached, optimizer.error(), way)
+        reached, reached_error = _search_on(graph, reached, reached_error, way)
         converged = error - reached_error < config.polish_tolerance * error
         values, error = reached, reached_error
         if converged:
@@ -185,7 +193,7 @@ def build_graph(
             measure: Callable[[], StructurelessMeasurement] = partial(
                 measurement_of, snapshot, neighbours, views, config, thin=thin, robust_px=robust_px
             )
-            size = BYTES_PER_MEASUREMENT * len(neighbours) * len(keyframe.log_depth)
+            size = BYTES_PER_MEASUREMENT * len(neighbours) * len(keyframe.log_depth) // (2 if thin else 1)
             if size <= room:
                 room -= size
                 measure = cache(measure)
