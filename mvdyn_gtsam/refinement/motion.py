@@ -32,6 +32,11 @@ Labels = npt.NDArray[np.int32]
 LEAST_TRUST = 0.05
 """Of the best pixel of a frame; below, there is nothing to continue into the rest."""
 
+LEAK_REACH = 0.2
+"""Up to how far the depth of what moves leaks into plain walls, as a share of the image's width; twice as far
+it does no more. Source: 0.1 to 0.3 compared on four rendered scenes."""
+OWN_SHARE = 0.4
+"""Of its own depth that a pixel keeps there, whatever the flow says. Source: 0.3 to 1 compared there."""
 LABELS = "labels"
 """The array of moving regions, numbered from 1 in every frame."""
 
@@ -55,7 +60,7 @@ def settle_task(context: Context, frame: Frame) -> list[RegionDepth]:
     # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
     # an average of depth cubed leans to the far side
     if trust.max() > LEAST_TRUST:
-        cubed = filled(np.exp(-3.0 * theta).astype(np.float32), trust)
+        cubed = filled(np.exp(-3.0 * theta).astype(np.float32), np.maximum(trust, _kept_far_off(around)))
         theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
         labels = _outlined(context, frame, labels > 0, around, theta)
     else:
@@ -132,6 +137,15 @@ def _observed(context: Context, frame: Frame, labels: Labels) -> list[RegionDept
         evidence = support(grey, labels == label, depth, rays, views)
         found.append(RegionDepth(frame, label, depth, evidence))
     return found
+
+
+def _kept_far_off(moves: Mask) -> Float32:
+    """``(h, w)`` share of its own depth that every pixel keeps: what is far from what ``moves (h, w)``
+    needs no depth from behind, and a plain thing in the foreground would be pushed back by it."""
+    if not moves.any():
+        return np.full(moves.shape, OWN_SHARE, np.float32)
+    distance = cv2.distanceTransform((~moves).astype(np.uint8), cv2.DIST_L2, 5) / moves.shape[1]
+    return np.asarray(OWN_SHARE * np.clip(distance / LEAK_REACH - 1.0, 0.0, 1.0), np.float32)
 
 
 def _outlined(context: Context, frame: Frame, moves: Mask, around: Mask, theta: Float32) -> Labels:

@@ -36,8 +36,10 @@ WELL_SEEN = 0.5
 """Mean trust from which a region needs no plane."""
 JUDGED_PIXELS = 60
 """Pixels of a region at which planes are compared."""
-WITNESSES = 3
-"""Planes, of this frame or others, that must agree."""
+MAJORITY = 0.5
+"""Of the planes that fit a region's rim, those that must agree on its depth."""
+TRUSTED_SIGMA = 0.1
+"""Standard deviation of a plane's log depth at which a pixel takes half of it."""
 
 
 @dataclass(frozen=True)
@@ -127,40 +129,77 @@ def fill_plain(
     wTc: Array,
     config: PlainConfig,
 ) -> Float32:
-    """``theta (h, w)`` with the agreed plane in every region, as far as ``trust (h, w)`` leaves room.
+    """``theta (h, w)`` with agreed planes, as far as ``trust (h, w)`` leaves room and a plane is known.
 
-    ``bank (N, 5)`` are the planes of all frames around, this one's among them. A region on which they do not
-    agree keeps its depth.
+    ``bank (N, 7)`` are the planes of all frames around, this one's among them: camera, time, and
+    ``planes_in_world``. A region on which they do not agree keeps its depth.
     """
-    planes, weight = planes_in_camera(bank[:, :4], wTc), bank[:, 4]
+    planes, weight = planes_in_camera(bank[:, 2:6], wTc), bank[:, 6]
+    frames = np.unique(bank[:, :2], axis=0, return_inverse=True)[1]
     result = theta.copy()
     for region in regions:
-        plane = agreed_plane(region, planes, weight, config)
-        if plane is None:
+        agreed = agreed_plane(region, planes, weight, frames, config)
+        if agreed is None:
             continue
         low, high = _range(region, config)
-        filled = np.log(np.clip(region.rays @ plane, low, high)).astype(np.float32)
-        own = trust.ravel()[region.pixels]
-        result.ravel()[region.pixels] = own * theta.ravel()[region.pixels] + (1.0 - own) * filled
+        filled = np.log(np.clip(region.rays @ agreed.plane, low, high)).astype(np.float32)
+        known = 1.0 / (1.0 + (_uncertainty(region, agreed, config) / TRUSTED_SIGMA) ** 2)
+        share = ((1.0 - trust.ravel()[region.pixels]) * known).astype(np.float32)
+        result.ravel()[region.pixels] += share * (filled - theta.ravel()[region.pixels])
     return result
 
 
-def agreed_plane(region: PlainRegion, planes: Array, weight: Array, config: PlainConfig) -> Array | None:
-    """Of ``planes (N, 3)`` that fit the region's rim the one that most others resemble; None without
-    witnesses."""
+@dataclass(frozen=True)
+class AgreedPlane:
+    """A plane ``q`` and the frames that found it."""
+
+    plane: Array
+    """``(3,)``"""
+    frames: int
+
+
+def agreed_plane(
+    region: PlainRegion, planes: Array, weight: Array, frames: npt.NDArray[np.int64], config: PlainConfig
+) -> AgreedPlane | None:
+    """Of ``planes (N, 3)`` that fit the region's rim the one that most others resemble.
+
+    ``frames (N,)`` says which come from one frame. None where too few frames, or less than half of the planes
+    that fit, agree.
+    """
     shares = _share(planes, region.rim_rays, region.rim_inverse_depth, region.rim_trust, config)
     sample = region.rays[:: max(1, len(region.rays) // JUDGED_PIXELS)]
     inverse_depth = planes @ sample.T
     low, high = _range(region, config)
     inside = ((inverse_depth > low) & (inverse_depth < high)).mean(axis=1) > 0.8
     fits = np.flatnonzero((shares > config.rim_share) & inside)
-    if len(fits) < WITNESSES:
+    if len(fits) == 0:
         return None
     log_depth = np.log(np.clip(inverse_depth[fits], low, high))
     alike = np.abs(log_depth[:, None] - log_depth[None]).mean(axis=2) < config.agreement
     votes = alike @ (weight * shares)[fits] * shares[fits]
     best = votes.argmax()
-    return np.asarray(planes[fits[best]]) if alike[best].sum() >= WITNESSES else None
+    witnesses = len(np.unique(frames[fits[alike[best]]]))
+    # short videos have fewer frames to ask
+    wanted = min(config.witnesses, -(-(int(frames.max()) + 1) // 2))
+    if witnesses < wanted or alike[best].mean() < MAJORITY:
+        return None
+    return AgreedPlane(np.asarray(planes[fits[best]]), witnesses)
+
+
+def _uncertainty(region: PlainRegion, agreed: AgreedPlane, config: PlainConfig) -> Array:
+    """Standard deviation ``(M,)`` of the log depth of a region's pixels.
+
+    From how the fitting points of its rim lie: far from them, or across a line on which they are, little is
+    known. The error of one frame's rim is common to its points; frames are independent.
+    """
+    error = np.abs(region.rim_rays @ agreed.plane / region.rim_inverse_depth - 1.0)
+    fitting = error < 1.5 * config.tolerance
+    slope = region.rim_rays[fitting] / region.rim_inverse_depth[fitting, None]
+    weight = region.rim_trust[fitting] / region.rim_trust[fitting].sum()
+    information = (slope * weight[:, None]).T @ slope * agreed.frames / config.tolerance**2
+    at_pixels = region.rays / np.maximum(region.rays @ agreed.plane, _range(region, config)[0])[:, None]
+    covariance = np.linalg.pinv(information, hermitian=True)
+    return np.sqrt(np.einsum("ni,ij,nj->n", at_pixels, covariance, at_pixels))
 
 
 def _without_contrast(grey: Float32, excluded: Mask, config: PlainConfig) -> list[npt.NDArray[np.uint8]]:

@@ -33,6 +33,8 @@ class PlainConfig:
     agreement: float = 0.05
     """Mean relative difference of depth up to which two planes are alike on a region. Source: compared, 0.03
     and 0.05."""
+    witnesses: int = 8
+    """Frames that must agree; half of the frames around where there are fewer. Source: compared, 3 to 25."""
     reach: float = 0.7
     """A region lies no nearer than this share of its rim's nearest depth, nor farther than the farthest over
     it. Source: compared, 0.3 to 0.7."""

@@ -147,7 +147,7 @@ def fill_task(context: Context, job: tuple[str, str, Frame]) -> None:
         np.log(context.image(source, frame)),
         trust,
         found,
-        bank[near, 2:],
+        bank[near],
         context.poses()[frame],
         context.config.plain,
     )
