@@ -6,6 +6,7 @@ instant says of its depth; ``smooth_over_time`` makes that one over time; ``movi
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -60,7 +61,7 @@ def settle_task(context: Context, frame: Frame) -> list[RegionDepth]:
     # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
     # an average of depth cubed leans to the far side
     if trust.max() > LEAST_TRUST:
-        cubed = filled(np.exp(-3.0 * theta).astype(np.float32), np.maximum(trust, _kept_far_off(around)))
+        cubed = filled(np.exp(-3.0 * theta).astype(np.float32), np.maximum(trust, kept_far_off(around)))
         theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
         labels = _outlined(context, frame, labels > 0, around, theta)
     else:
@@ -139,7 +140,7 @@ def _observed(context: Context, frame: Frame, labels: Labels) -> list[RegionDept
     return found
 
 
-def _kept_far_off(moves: Mask) -> Float32:
+def kept_far_off(moves: Mask) -> Float32:
     """``(h, w)`` share of its own depth that every pixel keeps: what is far from what ``moves (h, w)``
     needs no depth from behind, and a plain thing in the foreground would be pushed back by it."""
     if not moves.any():
