@@ -142,10 +142,11 @@ def row(entry: Mapping[str, Any]) -> list[str]:
 
 
 def against_best(entries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Per capture: our ATE over the better baseline's, our time over the faster one's.
+    """Per capture: our ATE over the better baseline's, our CPU seconds over those of the one with fewer.
 
-    A baseline that failed has no ATE and no time to beat; one that left frames out is marked ``*``, since its
-    error leaves out the frames it failed on.
+    CPU seconds, since rows kept from different days were made under different loads. A baseline that failed has
+    no ATE and no time to beat; one that left frames out is marked ``*``, since its error leaves out the frames
+    it failed on.
     """
     rows = []
     for capture in dict.fromkeys(entry["capture"] for entry in entries):
@@ -156,11 +157,11 @@ def against_best(entries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
         ours, finished = own[0], [e for e in others if e["problem"] is None]
         scored = [e for e in finished if e["scores"] and e["scores"]["ate_m"] is not None]
         best = min(scored, key=lambda e: float(e["scores"]["ate_m"]), default=None)
-        timed = [e for e in finished if e["seconds"] is not None]
-        fastest = min(timed, key=lambda e: float(e["seconds"]), default=None)
+        timed = [e for e in finished if e["cpu_seconds"] is not None]
+        fastest = min(timed, key=lambda e: float(e["cpu_seconds"]), default=None)
         our_ate = ours["scores"]["ate_m"] if ours["scores"] else None
         best_ate = best["scores"]["ate_m"] if best else None
-        our_seconds = ours["seconds"] if ours["problem"] is None else None
+        our_seconds = ours["cpu_seconds"] if ours["problem"] is None else None
         rows.append(
             [
                 capture,
@@ -168,8 +169,8 @@ def against_best(entries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
                 "none finished" if best is None else _named(best, figure(best_ate, 1, 1e3)),
                 figure(_ratio(our_ate, best_ate), 2),
                 figure(our_seconds, 0),
-                "none finished" if fastest is None else _named(fastest, figure(fastest["seconds"], 0)),
-                figure(_ratio(our_seconds, fastest["seconds"] if fastest else None), 2),
+                "none finished" if fastest is None else _named(fastest, figure(fastest["cpu_seconds"], 0)),
+                figure(_ratio(our_seconds, fastest["cpu_seconds"] if fastest else None), 2),
             ]
         )
     return rows
@@ -218,8 +219,16 @@ def render(entries: Sequence[Mapping[str, Any]]) -> str:
 def render_best(entries: Sequence[Mapping[str, Any]]) -> str:
     """Ours against the better and the faster baseline of each capture, as Markdown."""
     rows = against_best(entries)
-    columns = ("capture", "ATE mm, ours", "better baseline", "ratio", "s, ours", "faster baseline", "ratio")
-    text = "Whole process against whole process. Ratio: ours over theirs.\n\n" + table(columns, rows)
+    columns = (
+        "capture",
+        "ATE mm, ours",
+        "better baseline",
+        "ratio",
+        "CPU s, ours",
+        "faster baseline",
+        "ratio",
+    )
+    text = "CPU seconds of whole processes. Ratio: ours over theirs.\n\n" + table(columns, rows)
     if any(cell.endswith("*)") for cells in rows for cell in cells):
         text += "\n\\* incomplete: some frames have no pose.\n"
     return text
