@@ -144,9 +144,9 @@ def row(entry: Mapping[str, Any]) -> list[str]:
 def against_best(entries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Per capture: our ATE over the better baseline's, our CPU seconds over those of the one with fewer.
 
-    CPU seconds, since rows kept from different days were made under different loads. A baseline that failed has
-    no ATE and no time to beat; one that left frames out is marked ``*``, since its error leaves out the frames
-    it failed on.
+    CPU seconds, since rows kept from different days were made under different loads. A baseline that failed
+    has no ATE and no time to beat; one that left frames out is marked ``*``, since its error leaves out the
+    frames it failed on.
     """
     rows = []
     for capture in dict.fromkeys(entry["capture"] for entry in entries):
