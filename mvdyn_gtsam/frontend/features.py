@@ -8,6 +8,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+ROWS_AT_ONCE = 256
+"""Keypoints compared with all of the other image at once: what stays in the processor's cache."""
+
 
 @dataclass(frozen=True)
 class Features:
@@ -43,14 +46,22 @@ def match_features(first: Features, second: Features, ratio: float) -> npt.NDArr
     """Index pairs ``(M, 2)`` of mutual nearest neighbours that pass Lowe's ratio test."""
     if len(first.pixels) < 2 or len(second.pixels) < 2:
         return np.zeros((0, 2), np.int64)
-    similarity = first.descriptors @ second.descriptors.T
-    best = similarity.argmax(1)
-    rows = np.arange(len(best))
-    top = similarity[rows, best]
-    mutual = similarity.argmax(0)[best] == rows
-    similarity[rows, best] = -1.0
-    runner_up = similarity.max(1)
+    count = len(first.pixels)
+    best = np.empty(count, np.int64)
+    top, runner_up = np.empty(count, np.float32), np.empty(count, np.float32)
+    top_of_second = np.full(len(second.pixels), -np.inf, np.float32)
+    for start in range(0, count, ROWS_AT_ONCE):
+        rows = slice(start, start + ROWS_AT_ONCE)
+        similarity = first.descriptors[rows] @ second.descriptors.T
+        np.maximum(top_of_second, similarity.max(0), out=top_of_second)
+        nearest = similarity.argmax(1)
+        each = np.arange(len(nearest))
+        best[rows], top[rows] = nearest, similarity[each, nearest]
+        similarity[each, nearest] = -1.0
+        runner_up[rows] = similarity.max(1)
     # Unit descriptors: squared distance = 2 - 2 * similarity.
     distinct = (1.0 - top) < ratio**2 * (1.0 - runner_up)
-    chosen = np.flatnonzero(mutual & distinct)
+    chosen = np.flatnonzero((top == top_of_second[best]) & distinct)
+    # of several that look exactly alike, the first
+    chosen = chosen[np.sort(np.unique(best[chosen], return_index=True)[1])]
     return np.stack([chosen, best[chosen]], axis=1)

@@ -66,3 +66,20 @@ def test_only_mutual_neighbours_match() -> None:
     # 0 and 8 degrees both like 7 best; 7 likes 8 best.
     pairs = match_features(at_angles(0.0, 8.0), at_angles(7.0, 120.0), 0.99)
     assert pairs.tolist() == [[1, 0]]
+
+
+def test_matches_are_those_of_comparing_all_at_once() -> None:
+    random = np.random.default_rng(0)
+    descriptors = random.random((700, 128)).astype(np.float32)
+    seen = np.concatenate([descriptors[::2], descriptors[:1]]) + np.float32(0.1) * random.random((351, 128))
+    first, second = (
+        Features(np.zeros((len(rows), 2)), (rows / np.linalg.norm(rows, axis=1)[:, None]).astype(np.float32))
+        for rows in (np.concatenate([descriptors, descriptors[5:6]]), seen)
+    )
+    similarity = first.descriptors.astype(np.float64) @ second.descriptors.T
+    best, back = similarity.argmax(1), similarity.argmax(0)
+    ordered = np.sort(similarity, axis=1)
+    distinct = (1.0 - ordered[:, -1]) < 0.8**2 * (1.0 - ordered[:, -2])
+    expected = [(i, best[i]) for i in range(len(best)) if back[best[i]] == i and distinct[i]]
+    assert len(expected) > 300
+    np.testing.assert_array_equal(match_features(first, second, 0.8), expected)
