@@ -18,7 +18,7 @@ from mvdyn_gtsam.errors import MvdynError
 
 PAGES = {
     "accuracy": "accuracy.md",
-    "time": "accuracy_against_best.md",
+    "time": "glomap_against_best.md",
     "refinement": "refinement_phases.md",
     "start": "wide_baseline.md",
     "memory": "scaling_frames.md",
