@@ -38,6 +38,10 @@ LEAK_REACH = 0.2
 it does no more. Source: 0.1 to 0.3 compared on four rendered scenes."""
 OWN_SHARE = 0.4
 """Of its own depth that a pixel keeps there, whatever the flow says. Source: 0.3 to 1 compared there."""
+FEET = 0.1
+"""Lowest share of a thing's height at which it touches the ground."""
+GROUND_ROWS = 2
+"""Rows of the view below it that are the ground."""
 LABELS = "labels"
 """The array of moving regions, numbered from 1 in every frame."""
 
@@ -102,18 +106,24 @@ def depth_of_regions(
 
 
 def moving_depth_task(context: Context, job: tuple[Frame, dict[int, float]]) -> None:
-    """Where phase 2 begins: what stands still as settled, moving regions at the log inverse depth given."""
+    """Where phase 2 begins: what stands still as settled, moving regions at the log inverse depth given.
+
+    Regions without one are put on the ground, and stay unexplained.
+    """
     frame, depths = job
     workspace, config = context.workspace, context.config
     labels = np.asarray(workspace.read(LABELS, frame))
     theta, weight = context.image("prior", frame), context.image("prior_weight", frame)
     moving = np.where(labels > 0, UNEXPLAINED, STATIC).astype(np.uint8)
     instant = context.image("instant", frame)
-    for label, depth in depths.items():
+    for label in range(1, int(labels.max()) + 1):
         region = labels == label
-        theta[region] = np.log(region_depth(instant, region, depth))
-        moving[region] = MOVING
-    weight[moving == MOVING] = config.moving_sigma**-2
+        if label in depths:
+            theta[region] = np.log(region_depth(instant, region, depths[label]))
+            moving[region] = MOVING
+        else:
+            theta[region] = standing(theta, region)
+    weight[moving != STATIC] = config.moving_sigma**-2
     workspace.write("prior", frame, theta)
     workspace.write("prior_weight", frame, weight)
     workspace.write("moving", frame, moving)
@@ -138,6 +148,23 @@ def _observed(context: Context, frame: Frame, labels: Labels) -> list[RegionDept
         evidence = support(grey, labels == label, depth, rays, views)
         found.append(RegionDepth(frame, label, depth, evidence))
     return found
+
+
+def standing(theta: Float32, region: Mask) -> Float32:
+    """Log inverse depth of the pixels of ``region (h, w)`` if it stands on what is below it in the image.
+
+    ``theta (h, w)`` is that of the background, kept where the lower end is not in the image. For things
+    that no other camera sees: most stand on the ground, and most cameras are held upright.
+    """
+    rows, columns = np.nonzero(region)
+    lowest = int(rows.max())
+    if lowest + GROUND_ROWS >= len(theta):
+        return theta[region]
+    height = lowest - int(rows.min()) + 1
+    feet = np.unique(columns[rows > lowest - max(1, round(FEET * height))])
+    ground = np.median(theta[lowest + 1 : lowest + 1 + GROUND_ROWS, feet])
+    # nothing stands behind its background
+    return np.maximum(theta[region], ground).astype(np.float32)
 
 
 def kept_far_off(moves: Mask) -> Float32:

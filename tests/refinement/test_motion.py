@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, kept_far_off
+from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, kept_far_off, standing
 
 
 def test_depth_is_kept_far_from_what_moves_only() -> None:
@@ -19,3 +19,28 @@ def test_depth_is_kept_far_from_what_moves_only() -> None:
 
 def test_without_motion_every_pixel_keeps_its_share() -> None:
     np.testing.assert_allclose(kept_far_off(np.zeros((4, 5), bool)), OWN_SHARE)
+
+
+def floor_and_wall() -> np.ndarray:
+    """Log inverse depth of a floor that comes nearer downwards from row 20, and a wall above."""
+    rows = np.arange(48, dtype=np.float32)[:, None] + np.zeros((1, 64), np.float32)
+    return np.log(0.2 + 0.02 * np.maximum(rows - 20.0, 0.0)).astype(np.float32)
+
+
+def test_a_thing_stands_where_its_feet_are() -> None:
+    theta, region = floor_and_wall(), np.zeros((48, 64), bool)
+    region[10:36, 30:34] = True
+    found = standing(theta, region)
+    np.testing.assert_allclose(found, theta[36:38, 0].mean(), atol=0.03)
+
+
+def test_a_thing_whose_feet_are_outside_keeps_its_background() -> None:
+    theta, region = floor_and_wall(), np.zeros((48, 64), bool)
+    region[10:48, 30:34] = True
+    np.testing.assert_array_equal(standing(theta, region), theta[region])
+
+
+def test_nothing_stands_behind_its_background() -> None:
+    theta, region = floor_and_wall()[::-1].copy(), np.zeros((48, 64), bool)
+    region[4:30, 30:34] = True
+    assert (standing(theta, region) >= theta[region]).all()
