@@ -38,7 +38,7 @@ JUDGED_PIXELS = 60
 """Pixels of a region at which planes are compared."""
 MAJORITY = 0.5
 """Of the planes that fit a region's rim, those that must agree on its depth."""
-TRUSTED_SIGMA = 0.1
+HALF_KNOWN_SIGMA = 0.1
 """Standard deviation of a plane's log depth at which a pixel takes half of it."""
 
 
@@ -143,7 +143,7 @@ def fill_plain(
             continue
         low, high = _range(region, config)
         filled = np.log(np.clip(region.rays @ agreed.plane, low, high)).astype(np.float32)
-        known = 1.0 / (1.0 + (_uncertainty(region, agreed, config) / TRUSTED_SIGMA) ** 2)
+        known = 1.0 / (1.0 + (_uncertainty(region, agreed, config) / HALF_KNOWN_SIGMA) ** 2)
         share = ((1.0 - trust.ravel()[region.pixels]) * known).astype(np.float32)
         result.ravel()[region.pixels] += share * (filled - theta.ravel()[region.pixels])
     return result

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.refinement.moving_depth import (
     InstantView,
@@ -16,19 +17,13 @@ from mvdyn_gtsam.refinement.moving_depth import (
     smooth_over_time,
     support,
 )
+from mvdyn_gtsam.refinement.views import DenseView
 
 SHAPE = (60, 80)
 REGION = np.zeros(SHAPE, bool)
 REGION[20:40, 30:50] = True
-INTRINSICS = np.array([[70.0, 0.0, 39.5], [0.0, 70.0, 29.5], [0.0, 0.0, 1.0]])
-RAYS = np.stack(
-    [
-        (np.tile(np.arange(80), 60) - 39.5) / 70.0,
-        (np.repeat(np.arange(60), 80) - 29.5) / 70.0,
-        np.ones(4800),
-    ],
-    axis=1,
-).astype(np.float32)
+VIEW = DenseView.of(Camera("cam0", 80, 60, 70.0, 70.0, 39.5, 29.5), 1.0)
+INTRINSICS, RAYS = VIEW.intrinsics, VIEW.rays
 
 
 def test_a_region_takes_its_commonest_depth() -> None:

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
 from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.views import DenseView
 
 CONFIG = RefinementConfig()
 SHAPE = (40, 60)
-INTRINSICS = np.array([[50.0, 0.0, 29.5], [0.0, 50.0, 19.5], [0.0, 0.0, 1.0]])
-RAYS = np.stack(
-    [
-        (np.tile(np.arange(60), 40) - 29.5) / 50.0,
-        (np.repeat(np.arange(40), 60) - 19.5) / 50.0,
-        np.ones(2400),
-    ],
-    axis=1,
-).astype(np.float32)
+VIEW = DenseView.of(Camera("cam0", 60, 40, 50.0, 50.0, 29.5, 19.5), 1.0)
+INTRINSICS, RAYS = VIEW.intrinsics, VIEW.rays
 WALL = (100.0 + 3.0 * np.arange(60, dtype=np.float32) + np.zeros((40, 1), np.float32)).astype(np.float32)
 """A wall 2 m away, brighter to the right; it is plain along a column."""
 
