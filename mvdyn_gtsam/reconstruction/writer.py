@@ -211,8 +211,14 @@ class ReconstructionWriter:
         write_atomically(arrays_path(self.folder, name), buffer.getvalue())
 
     def read_arrays(self, name: str) -> dict[str, npt.NDArray[Any]]:
-        """What ``write_arrays`` wrote, in this run or in the one that is resumed."""
-        with np.load(arrays_path(self.folder, name), allow_pickle=False) as arrays:
+        """What ``write_arrays`` wrote, in this run or in the one that is resumed.
+
+        Raises ResultError where that is missing, as in a copy without its diagnostics.
+        """
+        path = arrays_path(self.folder, name)
+        if not path.is_file():
+            raise ResultError(f"{path}: is missing, and the next stage needs it; start anew with --overwrite")
+        with np.load(path, allow_pickle=False) as arrays:
             return dict(arrays)
 
     def set_groups(self, groups: Sequence[Sequence[str]]) -> None:

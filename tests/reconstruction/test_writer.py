@@ -307,3 +307,11 @@ def test_arrays_and_diagnostics(tmp_path: Path) -> None:
     (tmp_path / "diagnostics" / "covariances.npz").write_bytes(b"PK")
     with pytest.raises(ResultError, match=r"covariances\.npz: damaged"):
         result.arrays("covariances")
+
+
+def test_missing_arrays_are_one_line_with_the_fix(tmp_path: Path) -> None:
+    with ReconstructionWriter.create(tmp_path, capture_info(), CONFIG) as writer:
+        with pytest.raises(ResultError, match=r"connections\.npz: is missing.*--overwrite"):
+            writer.read_arrays("connections")
+        writer.write_arrays("connections", {"frames": np.arange(4)})
+        np.testing.assert_array_equal(writer.read_arrays("connections")["frames"], np.arange(4))
