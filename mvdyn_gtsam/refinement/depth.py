@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -60,6 +61,29 @@ class FrameProblem:
     prior: DepthPrior
     config: RefinementConfig
 
+    @cached_property
+    def agreements(self) -> tuple[Agreement | None, ...]:
+        """What L_disp compares each edge with; None for those that it does not use."""
+        return tuple(self._agreement(edge) for edge in self.edges)
+
+    def _agreement(self, edge: Edge) -> Agreement | None:
+        theta_there = self.others.get(edge.j)
+        if theta_there is None or not self.config.disparity_weight > 0.0:
+            return None
+        inside = edge.nearest >= 0
+        weight = np.float32(self.config.disparity_weight) * edge.weight * inside
+        return Agreement(np.exp(theta_there.ravel()[edge.nearest]), weight)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """The depth of another frame where an edge's flow leads."""
+
+    inverse_depth: Float32
+    """``(M,)`` any where the flow leads outside."""
+    weight: Float32
+    """``(M,)`` of L_disp; 0 there."""
+
 
 @dataclass(frozen=True)
 class Normal:
@@ -99,19 +123,20 @@ def normal_equations(
     widening: float = 1.0,
 ) -> Normal:
     """The reweighted cost at ``theta (h, w)`` to second order; ``widening`` is of the smoothness kernel."""
-    edges, others, image_weights = problem.edges, problem.others, problem.image_weights
     prior, config = problem.prior, problem.config
     information, agreement, gradient = (np.zeros(theta.size, np.float32) for _ in range(3))
     inverse_depth = np.exp(theta).ravel()
-    for edge in edges:
-        terms = edge.terms(inverse_depth[edge.pixels])
-        _add_flow(information, gradient, edge, inverse_depth, terms, config)
-        theta_there = others.get(edge.j)
-        if theta_there is not None and config.disparity_weight > 0.0:
-            _add_ratio(agreement, gradient, edge, inverse_depth, terms, theta_there, config)
+    for edge, there in zip(problem.edges, problem.agreements, strict=True):
+        rho = inverse_depth[edge.pixels]
+        terms = edge.terms(rho)
+        _add_flow(information, gradient, edge, rho, terms, config)
+        if there is not None:
+            _add_ratio(agreement, gradient, edge, rho, terms, there, config)
     diagonal = information + agreement + prior.weight.ravel()
     gradient += (prior.weight * (theta - prior.theta)).ravel()
-    across, down, smooth_diagonal, smooth_gradient = _smoothness(theta, image_weights, config, widening)
+    across, down, smooth_diagonal, smooth_gradient = _smoothness(
+        theta, problem.image_weights, config, widening
+    )
     width = theta.shape[1]
     # dia_array: entry k of the diagonal with offset d belongs to column k
     bands = np.zeros((5, theta.size), np.float32)
@@ -144,7 +169,7 @@ def cost(
         if there is not None and config.disparity_weight > 0.0:
             seen = terms.valid & (edge.nearest >= 0)
             rho_j = np.exp(there.ravel()[edge.nearest[seen]])
-            ratio = ratio_terms(rho[seen], rho_j, terms.depth_ratio[seen], edge.jTi)
+            ratio = ratio_terms(rho[seen], rho_j, terms.depth_ratio[seen], edge.jTi[2, 3])
             each = robust_cost(np.abs(ratio.residual), config.disparity_lambda)
             total += config.disparity_weight * float((edge.weight[seen] * each).sum())
     scale = config.smoothness_scale
@@ -179,38 +204,35 @@ def _add_flow(
     information: Float32,
     gradient: Float32,
     edge: Edge,
-    inverse_depth: Float32,
+    rho: Float32,
     terms: FlowTerms,
     config: RefinementConfig,
 ) -> None:
-    residual = terms.residual
-    slope = terms.by_inverse_depth * inverse_depth[edge.pixels, None]
-    trust = edge.weight * terms.valid * confidence(np.abs(residual).sum(axis=1), config.flow_lambda)
-    weight = reweighted(residual, FLOW_FLOOR_PX)
-    weight *= (np.float32(config.flow_weight) * trust)[:, None]
-    weighted = weight * slope
-    # pixels occur once per edge
-    information[edge.pixels] += np.einsum("nk,nk->n", weighted, slope)
-    gradient[edge.pixels] += np.einsum("nk,nk->n", weighted, residual)
+    """Pixels occur once per edge; ``rho (M,)``."""
+    residual, slope = terms.residual.T, terms.by_inverse_depth.T * rho
+    trust = edge.weight * terms.valid
+    trust *= confidence(np.abs(residual[0]) + np.abs(residual[1]), config.flow_lambda)
+    trust *= np.float32(config.flow_weight)
+    weighted = reweighted(residual, FLOW_FLOOR_PX) * trust * slope
+    information[edge.pixels] += weighted[0] * slope[0] + weighted[1] * slope[1]
+    gradient[edge.pixels] += weighted[0] * residual[0] + weighted[1] * residual[1]
 
 
 def _add_ratio(
     agreement: Float32,
     gradient: Float32,
     edge: Edge,
-    inverse_depth: Float32,
+    rho: Float32,
     terms: FlowTerms,
-    theta_there: Float32,
+    there: Agreement,
     config: RefinementConfig,
 ) -> None:
-    rho, rho_j = inverse_depth[edge.pixels], np.exp(theta_there.ravel()[edge.nearest])
-    ratio = ratio_terms(rho, rho_j, terms.depth_ratio, edge.jTi)
-    seen = terms.valid & (edge.nearest >= 0)
-    trust = edge.weight * seen * confidence(np.abs(ratio.residual), config.disparity_lambda)
-    weight = np.float32(config.disparity_weight) * trust * reweighted(ratio.residual, RATIO_FLOOR)
+    ratio = ratio_terms(rho, there.inverse_depth, terms.depth_ratio, edge.jTi[2, 3])
+    weight = there.weight * terms.valid * confidence(np.abs(ratio.residual), config.disparity_lambda)
     slope = ratio.by_inverse_depth_i * rho
-    agreement[edge.pixels] += weight * slope**2
-    gradient[edge.pixels] += weight * slope * ratio.residual
+    weighted = weight * reweighted(ratio.residual, RATIO_FLOOR) * slope
+    agreement[edge.pixels] += weighted * slope
+    gradient[edge.pixels] += weighted * ratio.residual
 
 
 def _smoothness(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ from mvdyn_gtsam.frontend.dense_flow import Float32, pixel_raster
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import is_first
-from mvdyn_gtsam.refinement.residuals import FlowTerms, flow_terms
+from mvdyn_gtsam.refinement.residuals import FlowTerms, turned_flow_terms, turned_rays
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
@@ -47,9 +48,15 @@ class Edge:
     def same_instant(self) -> bool:
         return self.i[1] == self.j[1]
 
+    @cached_property
+    def turned(self) -> Float32:
+        """``(3, M)`` the rays in the axes of camera j."""
+        return turned_rays(self.rays, self.jTi)
+
     def terms(self, inverse_depth: Float32) -> FlowTerms:
         """L_flow at inverse depths ``(M,)``."""
-        return flow_terms(inverse_depth, self.rays, self.jTi, self.intrinsics_j, self.target)
+        translation = self.jTi[:3, 3]
+        return turned_flow_terms(inverse_depth, self.turned, translation, self.intrinsics_j, self.target)
 
     def without(self, excluded: npt.NDArray[np.bool_]) -> Edge:
         """The edge without the pixels of view i that ``excluded (N,)`` marks."""
@@ -79,16 +86,12 @@ def load_edges(
     raster = pixel_raster(workspace.views[i[0]].shape).reshape(-1, 2)
     for j in neighbours:
         first = is_first(i, j)
-        if not workspace.has_flow(*((i, j) if first else (j, i))):
+        ends = (i, j) if first else (j, i)
+        if not workspace.has_flow(*ends):
             continue
-        measured = workspace.read_flow(i, j) if first else workspace.read_flow(j, i, backward=True)
-        view_i, view_j = workspace.views[i[0]], workspace.views[j[0]]
-        weight = measured.weight.ravel()
-        if among is None:
-            pixels = np.flatnonzero(weight >= LEAST_WEIGHT)
-        else:
-            pixels = among[weight[among] >= LEAST_WEIGHT]
-        small = raster[pixels] + measured.flow.reshape(-1, 2)[pixels]
+        measured = workspace.read_flow(*ends, backward=not first, among=among, least=LEAST_WEIGHT)
+        view_i, view_j, pixels = workspace.views[i[0]], workspace.views[j[0]], measured.pixels
+        small = raster[pixels] + measured.flow
         edges.append(
             Edge(
                 i=i,
@@ -96,7 +99,7 @@ def load_edges(
                 pixels=pixels,
                 rays=view_i.rays[pixels],
                 target=_in_full_pixels(small, view_j),
-                weight=weight[pixels],
+                weight=measured.weight,
                 nearest=_nearest(small, view_j.shape),
                 jTi=invert_pose(wTc[j]) @ wTc[i],
                 intrinsics_j=view_j.camera.intrinsics,
@@ -109,10 +112,12 @@ def _in_full_pixels(small: Float32, view: DenseView) -> Float32:
     scale = np.array(
         [view.camera.width / view.shape[1], view.camera.height / view.shape[0]], dtype=np.float32
     )
-    return (small + np.float32(0.5)) * scale - np.float32(0.5)
+    # each axis in one piece of memory: the residuals are computed by axis
+    by_axis = np.ascontiguousarray(small.T) + np.float32(0.5)
+    return (by_axis * scale[:, None] - np.float32(0.5)).T
 
 
 def _nearest(target: Float32, shape: tuple[int, int]) -> npt.NDArray[np.int64]:
-    col, row = np.rint(target).astype(np.int64).T
+    col, row = np.rint(np.ascontiguousarray(target.T)).astype(np.int32)
     inside = (col >= 0) & (row >= 0) & (col < shape[1]) & (row < shape[0])
-    return np.where(inside, row * shape[1] + col, -1)
+    return np.where(inside, row.astype(np.int64) * shape[1] + col, -1)

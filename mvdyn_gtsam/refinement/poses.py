@@ -14,19 +14,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from factors.projection import adjoint
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.refinement.depth import LARGEST_STEP
-from mvdyn_gtsam.refinement.residuals import Float, pose_derivative
-from mvdyn_gtsam.refinement.samples import FrameSample
-from mvdyn_gtsam.refinement.scale import (
-    FrameSystem,
-    PairTerms,
+from mvdyn_gtsam.refinement.descent import FrameSystem, descend
+from mvdyn_gtsam.refinement.reprojection import (
     Samples,
-    descend,
     independent_share,
     normal_terms,
-    pair_terms,
+    reprojection_terms,
 )
+from mvdyn_gtsam.refinement.residuals import twist_derivative
+from mvdyn_gtsam.refinement.samples import FrameSample
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 
 Array = npt.NDArray[np.float64]
@@ -78,8 +77,8 @@ class _SampleTerms:
     """One sample linearised over its frame and its neighbours."""
 
     frames: list[int]
-    hessian: Array
-    gradient: Array
+    pairs: list[tuple[Array, Array]]
+    """Matrix ``(12, 12)`` and gradient ``(12,)`` of the frame and each of its neighbours."""
     cost: float
     depth_information: Array
     """``(M,)`` of each pixel's log inverse depth."""
@@ -116,13 +115,13 @@ class PoseProblem:
                 continue
             typical[sample.i] = 1.0 / np.median(usable)
             terms = self._linearised(sample, number, state)
-            hessian, gradient = terms.hessian, terms.gradient
-            if self._config.joint:
-                scaled = terms.depth_by_pose / terms.depth_information[:, None]
-                hessian = hessian - terms.depth_by_pose.T @ scaled
-                gradient = gradient - scaled.T @ terms.depth_gradient
             share = independent_share(sample)
-            system.add(terms.frames, share * hessian, share * gradient, share * terms.cost)
+            system.cost += share * terms.cost
+            for frame, (hessian, gradient) in zip(terms.frames[1:], terms.pairs, strict=True):
+                system.add([terms.frames[0], frame], share * hessian, share * gradient)
+            if self._config.joint:
+                scaled = share * terms.depth_by_pose / terms.depth_information[:, None]
+                system.add(terms.frames, -scaled.T @ terms.depth_by_pose, -scaled.T @ terms.depth_gradient)
         self._add_pose_terms(system, state.wTc, typical)
         return system
 
@@ -155,29 +154,29 @@ class PoseProblem:
         change = np.zeros(count) if state.depth_change is None else state.depth_change[number]
         rho = sample.inverse_depth * np.exp(change) if joint else sample.inverse_depth
         hold = self._config.prior_sigma**-2
-        hessian, gradient = np.zeros((6 * size, 6 * size)), np.zeros(6 * size)
+        cameras, times = np.array(sample.neighbours, int).reshape(-1, 2).T
+        jTi = invert_pose(state.wTc[cameras, times]) @ state.wTc[sample.i]
+        terms = reprojection_terms(sample, rho, sample.inverse_depth_there, jTi, self._config)
+        by_twist = twist_derivative(terms.seen, rho[terms.points], sample.intrinsics[terms.neighbour])
+        by_poses = [_by_both_poses(twist) for twist in adjoint(jTi)]
+        pairs = []
+        for part, both in zip(terms.parts, by_poses, strict=True):
+            hessian, gradient = normal_terms(by_twist, terms, part)
+            pairs.append((both.T @ hessian @ both, both.T @ gradient))
         information, depth_gradient = np.full(count, hold), hold * change
         coupling = np.zeros((count, 6 * size))
-        cost = 0.5 * hold * float(change @ change)
-        for k, j in enumerate(sample.neighbours):
-            jTi = invert_pose(state.wTc[j]) @ state.wTc[sample.i]
-            terms = pair_terms(sample, k, rho, sample.inverse_depth_there[k], jTi, self._config)
-            cost += terms.cost
-            if len(terms.points) == 0:
-                continue
-            jacobian = _pose_jacobian(sample, k, rho, jTi, terms)
-            columns = np.r_[0:6, 6 * (k + 1) : 6 * (k + 2)]
-            pair_hessian, pair_gradient = normal_terms(jacobian, terms)
-            hessian[np.ix_(columns, columns)] += pair_hessian
-            gradient[columns] += pair_gradient
-            if joint:
-                by_depth = _depth_jacobian(terms, rho)
-                weighted = terms.information * by_depth
-                information[terms.points] += (weighted * by_depth).sum(axis=1)
-                depth_gradient[terms.points] += (weighted * terms.residual).sum(axis=1)
-                coupling[np.ix_(terms.points, columns)] += np.einsum("nc,ncm->nm", weighted, jacobian)
+        if joint:
+            by_depth = terms.by_inverse_depth * rho[terms.points]
+            weighted = terms.information * by_depth
+            information += np.bincount(terms.points, (weighted * by_depth).sum(axis=0), count)
+            depth_gradient += np.bincount(terms.points, (weighted * terms.residual).sum(axis=0), count)
+            coupled = np.einsum("cn,cmn->nm", weighted, by_twist)
+            for k, (part, both) in enumerate(zip(terms.parts, by_poses, strict=True)):
+                columns = np.r_[0:6, 6 * (k + 1) : 6 * (k + 2)]
+                coupling[np.ix_(terms.points[part], columns)] += coupled[part] @ both
         frames = [camera * self._shape[1] + time for camera, time in (sample.i, *sample.neighbours)]
-        return _SampleTerms(frames, hessian, gradient, cost, information, depth_gradient, coupling)
+        cost = terms.cost + 0.5 * hold * float(change @ change)
+        return _SampleTerms(frames, pairs, cost, information, depth_gradient, coupling)
 
     def _add_pose_terms(self, system: FrameSystem, wTc: Array, typical: Array) -> None:
         self.free[:] = False
@@ -225,20 +224,9 @@ class PoseProblem:
             system.add([frame, frame + 1], jacobian.T @ jacobian, jacobian.T @ residual, cost)
 
 
-def ratio_pose_derivative(inverse_depth: Float, rays: Float, jTi: Array) -> tuple[Array, Array]:
-    """Derivatives ``(N, 6)`` of the residual of L_disp by right perturbations of ``wTi`` and of ``wTj``.
-
-    The residual is ``log rho_i - log rho_j - log z`` with ``z`` the depth in j over that in i. The point
-    divided by its depth in i moves by ``omega x ray + rho v`` in frame i and by ``-(omega x p + rho v)`` in
-    frame j.
-    """
-    point = rays @ jTi[:3, :3].T + inverse_depth[:, None] * jTi[:3, 3]
-    axis_i = np.broadcast_to(jTi[2, :3], rays.shape)
-    axis_j = np.broadcast_to(np.array([0.0, 0.0, 1.0]), rays.shape)
-    scale = 1.0 / point[:, 2:]
-    by_wTi = -scale * np.concatenate([np.cross(rays, axis_i), inverse_depth[:, None] * axis_i], axis=1)
-    by_wTj = scale * np.concatenate([np.cross(point, axis_j), inverse_depth[:, None] * axis_j], axis=1)
-    return by_wTi, by_wTj
+def _by_both_poses(adjoint_jTi: Array) -> Array:
+    """Twist ``(6, 12)`` of the points in frame j by right perturbations of ``wTi`` and ``wTj``."""
+    return np.hstack([adjoint_jTi, -np.eye(6)])
 
 
 def prior_terms(prior_wTc: Array, wTc: Array) -> tuple[Array, Array]:
@@ -286,20 +274,6 @@ def retracted(wTc: Array, delta: Array) -> Array:
     result[..., :3, :3] = wTc[..., :3, :3] @ turn
     result[..., :3, 3] += (wTc[..., :3, :3] @ way)[..., 0]
     return result
-
-
-def _pose_jacobian(sample: FrameSample, k: int, rho: Array, jTi: Array, terms: PairTerms) -> Array:
-    """``(n, 3, 12)`` of the residuals of a pair by both poses."""
-    rays, depth = sample.rays[terms.points], rho[terms.points]
-    flow = pose_derivative(depth, rays, jTi, sample.intrinsics[k])
-    ratio = ratio_pose_derivative(depth, rays, jTi)
-    return np.concatenate([np.concatenate(flow, axis=2), np.concatenate(ratio, axis=1)[:, None]], axis=1)
-
-
-def _depth_jacobian(terms: PairTerms, rho: Array) -> Array:
-    """``(n, 3)`` of the residuals of a pair by the logarithm of the inverse depth."""
-    by_rho = np.column_stack([terms.flow.by_inverse_depth, terms.ratio.by_inverse_depth_i])
-    return by_rho * rho[terms.points, None]
 
 
 def _cross_matrix(vectors: Array) -> Array:

@@ -20,7 +20,7 @@ class FlowTerms:
     """L_flow of one directed pair at its points, linearised."""
 
     residual: Float
-    """``(N, 2)`` px: reprojection minus flow."""
+    """``(N, 2)`` px: reprojection minus flow; its transpose is in one piece of memory."""
     by_inverse_depth: Float
     """``(N, 2)`` derivative by ``rho``."""
     depth_ratio: Float
@@ -36,44 +36,63 @@ def flow_terms(
 
     ``intrinsics_j`` is ``(3, 3)``. Points behind camera j have zero residual and derivative.
     """
-    kind = rays.dtype
-    # the point of frame j divided by its depth in frame i: finite at infinity
-    x, y, z = (rays @ jTi[:3, :3].T.astype(kind)).T + jTi[:3, 3].astype(kind)[:, None] * inverse_depth
-    valid = z > 1e-3
-    scale = np.where(valid, 1.0 / np.where(valid, z, 1.0), 0.0).astype(kind)
-    x *= scale
-    y *= scale
-    residual, slope = np.empty((len(x), 2), kind), np.empty((len(x), 2), kind)
-    for axis, seen in enumerate((x, y)):
-        focal, centre = kind.type(intrinsics_j[axis, axis]), kind.type(intrinsics_j[axis, 2])
-        across, along = kind.type(jTi[axis, 3]), kind.type(jTi[2, 3])
-        residual[:, axis] = seen * focal + centre - target[:, axis]
-        slope[:, axis] = (across - seen * along) * (scale * focal)
-    residual[~valid] = 0.0
-    return FlowTerms(residual, slope, z, valid)
+    return turned_flow_terms(inverse_depth, turned_rays(rays, jTi), jTi[:3, 3], intrinsics_j, target)
 
 
-def pose_derivative(
-    inverse_depth: Float, rays: Float, jTi: Array, intrinsics_j: Array
-) -> tuple[Array, Array]:
-    """Derivatives ``(N, 2, 6)`` of the reprojection by right perturbations of ``wTi`` and of ``wTj``.
+def turned_rays(rays: Float, jTi: Array) -> Float:
+    """``rays (N, 3)`` of frame i in the axes of frame j, ``(3, N)``."""
+    return np.asarray(jTi[:3, :3].astype(rays.dtype) @ rays.T)
 
-    Tangent ``[omega, v]``: ``wTi exp(delta)``. With ``jTi = wTj^-1 wTi`` the point ``p_i`` moves by
-    ``omega x p_i + v`` in frame i, and ``p_j`` by ``-(omega x p_j + v)`` in frame j.
+
+def turned_flow_terms(
+    inverse_depth: Float, turned: Float, translation: Array, intrinsics_j: Array, target: Float
+) -> FlowTerms:
+    """``flow_terms`` of rays that are ``turned (3, N)`` already, which is the same at every depth.
+
+    ``translation`` of ``jTi`` is ``(3,)`` or ``(3, N)``, ``intrinsics_j`` is ``(3, 3)`` or ``(N, 3, 3)``.
     """
-    point = rays @ jTi[:3, :3].T + inverse_depth[:, None] * jTi[:3, 3]
-    scale = 1.0 / point[:, 2]
-    fx, fy = intrinsics_j[0, 0], intrinsics_j[1, 1]
-    by_point = np.zeros((len(rays), 2, 3))
-    by_point[:, 0, 0] = fx * scale
-    by_point[:, 0, 2] = -fx * point[:, 0] * scale**2
-    by_point[:, 1, 1] = fy * scale
-    by_point[:, 1, 2] = -fy * point[:, 1] * scale**2
-    # points are scaled by rho, so that a translation of v moves them by rho v
-    by_i = by_point @ jTi[:3, :3]
-    by_wTi = np.concatenate([_cross_rows(rays, by_i), inverse_depth[:, None, None] * by_i], axis=2)
-    by_wTj = -np.concatenate([_cross_rows(point, by_point), inverse_depth[:, None, None] * by_point], axis=2)
-    return by_wTi, by_wTj
+    kind = turned.dtype
+    shift = translation.astype(kind)
+    # the point of frame j divided by its depth in frame i: finite at infinity
+    x, y, z = (turned[axis] + shift[axis] * inverse_depth for axis in range(3))
+    valid = z > 1e-3
+    behind = not valid.all()
+    scale = kind.type(1.0) / (np.where(valid, z, kind.type(1.0)) if behind else z)
+    # each axis in one piece of memory, as everything here is done by axis
+    residual, slope = np.empty((2, len(x)), kind), np.empty((2, len(x)), kind)
+    for axis, seen in enumerate((x, y)):
+        focal, centre = (intrinsics_j[..., axis, column].astype(kind) for column in (axis, 2))
+        seen *= scale
+        np.multiply(seen, focal, out=residual[axis])
+        residual[axis] += centre - target[:, axis]
+        np.multiply(seen, -shift[2], out=slope[axis])
+        slope[axis] += shift[axis]
+        slope[axis] *= scale * focal
+    if behind:
+        residual[:, ~valid] = slope[:, ~valid] = 0.0
+    return FlowTerms(residual.T, slope.T, z, valid)
+
+
+def twist_derivative(point: Array, inverse_depth: Array, intrinsics_j: Array) -> Array:
+    """Derivative ``(3, 6, N)`` of the reprojection, in x and y px, and of L_disp's residual by a twist
+    ``[omega, v]`` of the points in frame j, which moves them by ``omega x p + v``.
+
+    ``point (3, N)`` are the points divided by their depths in i, whose inverses are ``inverse_depth (N,)``.
+    By right perturbations of ``wTi`` the derivative is this times the adjoint of ``jTi``, by those of ``wTj``
+    its negative. ``intrinsics_j`` is ``(3, 3)`` or ``(N, 3, 3)``.
+    """
+    x, y = point[0] / point[2], point[1] / point[2]
+    # a translation counts by the true depth in j
+    near = inverse_depth / point[2]
+    result = np.zeros((3, 6, len(near)))
+    fx, fy = intrinsics_j[..., 0, 0], intrinsics_j[..., 1, 1]
+    result[0, 0], result[0, 1], result[0, 2] = -fx * x * y, fx * (1.0 + x * x), -fx * y
+    result[0, 3], result[0, 5] = fx * near, -fx * x * near
+    result[1, 0], result[1, 1], result[1, 2] = -fy * (1.0 + y * y), fy * x * y, fy * x
+    result[1, 4], result[1, 5] = fy * near, -fy * y * near
+    # of log rho_i - log rho_j - log z
+    result[2, 0], result[2, 1], result[2, 5] = -y, x, -near
+    return result
 
 
 @dataclass(frozen=True)
@@ -88,16 +107,19 @@ class RatioTerms:
     """``(N,)``"""
 
 
-def ratio_terms(inverse_depth_i: Float, inverse_depth_j: Float, depth_ratio: Float, jTi: Array) -> RatioTerms:
+def ratio_terms(
+    inverse_depth_i: Float, inverse_depth_j: Float, depth_ratio: Float, along: Array | float
+) -> RatioTerms:
     """L_disp: ``log(D_j / D_j^flow)`` with ``D_j^flow = depth_ratio / rho_i``.
 
     ``max(a, b) / min(a, b) - 1`` of the paper is ``exp(|log(a / b)|) - 1``: the same to first order, and the
-    logarithm is symmetric and does not run away. ``depth_ratio`` is ``FlowTerms.depth_ratio``.
+    logarithm is symmetric and does not run away. ``depth_ratio`` is ``FlowTerms.depth_ratio``, ``along`` the
+    translation of ``jTi`` along the axis of camera j, one number or ``(N,)``.
     """
     kind = inverse_depth_i.dtype
     ratio = np.maximum(depth_ratio, 1e-3)
     residual = np.log(inverse_depth_i / (ratio * inverse_depth_j))
-    by_i = 1.0 / inverse_depth_i - kind.type(jTi[2, 3]) / ratio
+    by_i = 1.0 / inverse_depth_i - np.asarray(along, kind) / ratio
     return RatioTerms(residual.astype(kind), by_i.astype(kind), (-1.0 / inverse_depth_j).astype(kind))
 
 
@@ -113,8 +135,3 @@ def confidence(cost: Float, scale: float) -> Float:
 def reweighted(residual: Float, floor: float) -> Float:
     """Weight ``1 / max(|r|, floor)`` under which the square of ``r`` stands for its absolute value."""
     return (1.0 / np.maximum(np.abs(residual), floor)).astype(residual.dtype)
-
-
-def _cross_rows(points: Float, by_point: Array) -> Array:
-    """``(N, 2, 3)``: derivative by ``omega`` of what moves points by ``omega x point``."""
-    return np.cross(points[:, None, :], by_point)

@@ -25,18 +25,22 @@ JOURNAL = "journal.json"
 STEPS_PER_PX = 64
 """Flow is kept as 16-bit integers of 1/64 px where it fits: float16 would round a flow of 300 px to 0.25
 px."""
+FLOW_HEADER_BYTES, FLOW_BYTES_PER_PIXEL = 8, 5
+"""Of one direction on disk: the steps per px; two 16-bit numbers and a weight of 8 bits."""
 
 
 @dataclass(frozen=True)
 class DirectedFlow:
-    """Flow of one frame to another, in the views' pixels."""
+    """Flow of one frame to another at ``M`` pixels, in the views' pixels."""
 
     i: Frame
     j: Frame
+    pixels: npt.NDArray[np.int64]
+    """``(M,)`` flat indices in view i, ascending."""
     flow: Float32
-    """``(h_i, w_i, 2)``"""
+    """``(M, 2)``"""
     weight: Float32
-    """``(h_i, w_i)`` in [0, 1]"""
+    """``(M,)`` in [0, 1]"""
 
 
 class Workspace:
@@ -114,29 +118,53 @@ class Workspace:
 
     def write_flow(self, i: Frame, j: Frame, pair: FlowPair) -> None:
         """Keep both directions of a pair measured on full images, averaged down to the views."""
-        arrays = {}
-        for name, frame, other, flow, weight in (
-            ("forward", i, j, pair.forward, pair.forward_weight),
-            ("backward", j, i, pair.backward, pair.backward_weight),
-        ):
-            small, trust = self._shrunk(frame, other, flow, weight)
-            steps = min(float(STEPS_PER_PX), 32000.0 / max(1.0, float(np.abs(small).max())))
-            arrays[name] = np.rint(small * np.float32(steps)).astype(np.int16)
-            arrays[f"{name}_weight"] = np.rint(trust * 255.0).astype(np.uint8)
-            arrays[f"{name}_steps"] = np.array(steps)
         path = self._flow_path(i, j)
-        temporary = path.with_name(f".{path.name}.part.npz")
+        temporary = path.with_name(f".{path.name}.part")
         with _writing(path):
-            np.savez(temporary, **arrays)
+            with temporary.open("wb") as file:
+                for frame, other, flow, weight in (
+                    (i, j, pair.forward, pair.forward_weight),
+                    (j, i, pair.backward, pair.backward_weight),
+                ):
+                    small, trust = self._shrunk(frame, other, flow, weight)
+                    steps = min(float(STEPS_PER_PX), 32000.0 / max(1.0, float(np.abs(small).max())))
+                    file.write(np.float64(steps).tobytes())
+                    file.write(np.rint(small * np.float32(steps)).astype(np.int16).tobytes())
+                    file.write(np.rint(trust * 255.0).astype(np.uint8).tobytes())
             temporary.replace(path)
 
-    def read_flow(self, i: Frame, j: Frame, backward: bool = False) -> DirectedFlow:
-        """One direction of a measured pair: i to j, or with ``backward`` j to i."""
-        name = "backward" if backward else "forward"
-        with np.load(self._flow_path(i, j)) as arrays:
-            flow = arrays[name].astype(np.float32) / np.float32(arrays[f"{name}_steps"])
-            weight = arrays[f"{name}_weight"].astype(np.float32) / np.float32(255.0)
-        return DirectedFlow(j, i, flow, weight) if backward else DirectedFlow(i, j, flow, weight)
+    def read_flow(
+        self,
+        i: Frame,
+        j: Frame,
+        backward: bool = False,
+        among: npt.NDArray[np.int64] | None = None,
+        least: float = 0.0,
+    ) -> DirectedFlow:
+        """One direction of a measured pair: i to j, or with ``backward`` j to i.
+
+        At the pixels ``among`` (flat indices, ascending) or all, of those where its weight is ``least``
+        or more.
+        """
+        sizes = [shape[0] * shape[1] for shape in (self.views[i[0]].shape, self.views[j[0]].shape)]
+        count = sizes[1] if backward else sizes[0]
+        # a direction is the steps per px, the flow and its weight, one after the other
+        start = FLOW_HEADER_BYTES + FLOW_BYTES_PER_PIXEL * sizes[0] if backward else 0
+        length = FLOW_HEADER_BYTES + FLOW_BYTES_PER_PIXEL * count
+        raw = np.fromfile(self._flow_path(i, j), np.uint8, length, offset=start)
+        steps = raw[:FLOW_HEADER_BYTES].view(np.float64)[0]
+        flow, weight = raw[FLOW_HEADER_BYTES:-count].view(np.int16).reshape(count, 2), raw[-count:]
+        if among is None:
+            pixels = np.flatnonzero(weight >= 255.0 * least)
+        else:
+            pixels = among[weight[among] >= 255.0 * least]
+        ends = (j, i) if backward else (i, j)
+        return DirectedFlow(
+            *ends,
+            pixels,
+            flow[pixels].astype(np.float32) / np.float32(steps),
+            weight[pixels].astype(np.float32) / np.float32(255.0),
+        )
 
     def _shrunk(self, i: Frame, j: Frame, flow: Float32, weight: Float32) -> tuple[Float32, Float32]:
         """Flow in the pixels of view j at the pixels of view i, and its weight."""
@@ -154,7 +182,7 @@ class Workspace:
         return (full + np.float32(0.5)) * other - np.float32(0.5) - raster, trust
 
     def _flow_path(self, i: Frame, j: Frame) -> Path:
-        return self.folder / "flow" / f"{i[0]}_{i[1]:06d}_{j[0]}_{j[1]:06d}.npz"
+        return self.folder / "flow" / f"{i[0]}_{i[1]:06d}_{j[0]}_{j[1]:06d}.bin"
 
 
 def _write_zeros(path: Path, dtype: np.dtype[np.generic], shape: tuple[int, ...]) -> None:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from mvdyn_gtsam.geometry import invert_pose, project, rotation_angle_deg, transform_points
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.depth import FLOW_FLOOR_PX, RATIO_FLOOR
+from mvdyn_gtsam.refinement.descent import FrameSystem, descend
 from mvdyn_gtsam.refinement.poses import (
     PoseProblem,
     PoseState,
@@ -25,8 +26,8 @@ from mvdyn_gtsam.refinement.poses import (
     smoothness_terms,
     solve_poses,
 )
+from mvdyn_gtsam.refinement.reprojection import independent_share
 from mvdyn_gtsam.refinement.samples import FrameSample
-from mvdyn_gtsam.refinement.scale import FrameSystem, descend, independent_share
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from tests.refinement.scenes import (
     INTRINSICS,

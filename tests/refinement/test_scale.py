@@ -8,17 +8,10 @@ import numpy as np
 import pytest
 
 from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.descent import FrameSystem, descend
+from mvdyn_gtsam.refinement.reprojection import independent_share, reprojection_terms, robust
 from mvdyn_gtsam.refinement.samples import FrameSample
-from mvdyn_gtsam.refinement.scale import (
-    FrameSystem,
-    Scales,
-    _ScaleProblem,
-    descend,
-    independent_share,
-    pair_terms,
-    robust,
-    solve_scales,
-)
+from mvdyn_gtsam.refinement.scale import Scales, _ScaleProblem, solve_scales
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from tests.refinement.scenes import Array, Scene, stream, two_cameras, with_noise, with_outliers
 
@@ -161,7 +154,7 @@ def test_it_does_not_pay_to_go_behind_a_camera(scene: Scene) -> None:
     behind, ahead = np.eye(4), np.eye(4)
     behind[2, 3], ahead[0, 3] = -100.0, 0.5
     costs = [
-        pair_terms(sample, 0, sample.inverse_depth, sample.inverse_depth_there[0], jTi, CONFIG).cost
+        reprojection_terms(sample, sample.inverse_depth, sample.inverse_depth_there, jTi[None], CONFIG).cost
         for jTi in (behind, ahead)
     ]
     assert costs[0] == pytest.approx(sample.weight.sum() * CONFIG.flow_lambda * (1.0 + np.log(20.0)))
@@ -207,9 +200,9 @@ def test_samples_are_streamed_once_per_iteration(scene: Scene, samples: list[Fra
 
 def test_robust_cost_is_the_papers_with_the_best_confidence() -> None:
     residual = np.array([[3.0, -1.0], [0.2, 0.3]])
-    cost, information = robust(residual, np.array([1.0, 2.0]), 1e-9, 1.0)
+    cost, information = robust(residual.T, np.array([1.0, 2.0]), 1e-9, 1.0)
     assert cost == pytest.approx((4.0 * 0.25 + np.log(4.0)) + 2.0 * 0.5)
-    np.testing.assert_allclose(information, [[0.25 / 3.0, 0.25], [2.0 / 0.2, 2.0 / 0.3]])
+    np.testing.assert_allclose(information.T, [[0.25 / 3.0, 0.25], [2.0 / 0.2, 2.0 / 0.3]])
 
 
 @pytest.mark.parametrize(("spacing", "expected"), [(2, 1.0 / 16.0), (4, 0.25), (8, 1.0), (16, 1.0)])
