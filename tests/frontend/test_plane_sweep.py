@@ -17,13 +17,14 @@ from mvdyn_gtsam.frontend.plane_sweep import (
     SweepConfig,
     SweepView,
     SweptDepth,
+    compared_levels,
     ladder_of,
     lowest,
     patch_likeness,
     semi_global,
     sweep,
 )
-from mvdyn_gtsam.geometry import invert_pose, pixel_rays
+from mvdyn_gtsam.geometry import invert_pose, pixel_rays, project, transform_points
 from tests.frontend.textures import to_image, values
 
 Array = npt.NDArray[np.float64]
@@ -268,3 +269,29 @@ def test_the_ladder_covers_what_is_known_and_more() -> None:
 def test_values_out_of_range_are_named(key: str, value: object) -> None:
     with pytest.raises(ConfigError, match=f"refinement.sweep.{key} "):
         replace(CONFIG, **{key: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("baseline", [0.01, 0.03])
+def test_a_view_near_by_is_compared_at_fewer_levels_and_says_the_same(baseline: float) -> None:
+    grey, near = render(pose(0.0))[0], seen(pose(baseline))
+    levels = compared_levels(grey.shape, INTRINSICS, near, LADDER, CONFIG.step_px)
+    assert levels[0] == 0 and levels[-1] == len(LADDER) - 1
+    assert len(levels) < 0.6 * len(LADDER)
+    plain = patch_likeness(grey, INTRINSICS, near, LADDER, replace(CONFIG, step_px=1e-9))
+    found = patch_likeness(grey, INTRINSICS, near, LADDER, CONFIG)
+    np.testing.assert_array_equal(found[levels], plain[levels])
+    both = (found != np.float32(CONFIG.unseen)) & (plain != np.float32(CONFIG.unseen))
+    np.testing.assert_allclose(found[:, :, 4:-4], plain[:, :, 4:-4], atol=0.05)
+    assert np.abs(found - plain)[both].mean() < 0.003
+
+
+def test_no_pixel_moves_farther_between_the_levels_compared() -> None:
+    wTc = pose(0.1, turn_deg=3.0, z=-0.2)
+    levels = compared_levels(TRUTH.shape, INTRINSICS, seen(wTc), LADDER, 1.0)
+    rays = pixel_rays(np.array([[0.0, 0.0], [20.0, 30.0], [40.0, 11.0]]), INTRINSICS)
+    seen_at = [
+        project(transform_points(invert_pose(wTc), rays / rho), INTRINSICS)[0] for rho in LADDER[levels]
+    ]
+    assert np.linalg.norm(np.diff(seen_at, axis=0), axis=2).max() < 1.05
+    every = compared_levels(TRUTH.shape, INTRINSICS, seen(pose(0.0, turn_deg=180.0)), LADDER, 1.0)
+    np.testing.assert_array_equal(every, np.arange(len(LADDER)))
