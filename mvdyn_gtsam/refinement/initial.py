@@ -75,7 +75,7 @@ def static_residual(inverse_depth: Float32, edges: Sequence[Edge]) -> Float32:
 def failing_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[np.uint8]:
     """``(h, w)`` 1 in the regions where the static model fails; ``residual (h, w)`` px, NaN: unknown."""
     fails = cv2.medianBlur((np.nan_to_num(residual) > config.moving_px).astype(np.uint8), 5)
-    labels = regions(_closed(fails, config), config)
+    labels = regions(closed(fails, config), config)
     strong = np.nan_to_num(residual) > 2.0 * config.moving_px
     result = np.zeros(residual.shape, np.uint8)
     for label in range(1, labels.max() + 1):
@@ -104,10 +104,10 @@ def moving_regions(
         votes[edge.pixels[seen]] += fails.ravel()[edge.nearest[seen]]
         count[edge.pixels[seen]] += 1.0
     moves = (votes >= config.moving_share * count).astype(np.uint8).reshape(own.shape)
-    return regions(_closed(cv2.medianBlur(moves, 5), config), config)
+    return regions(closed(cv2.medianBlur(moves, 5), config), config)
 
 
-def _closed(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArray[np.uint8]:
+def closed(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArray[np.uint8]:
     """``mask (h, w)`` with its gaps closed."""
     side = 2 * round(config.moving_gap * mask.shape[1] / 2) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))

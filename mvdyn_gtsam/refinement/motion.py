@@ -1,7 +1,9 @@
 """What moves in a frame, and where phase 2 begins with it.
 
-Three steps, since a frame asks others: ``settle_task`` finds what moves, its outline and what each region's
-instant says of its depth; ``smooth_over_time`` makes that one over time; ``moving_depth_task`` writes it.
+Five steps, since a frame asks others: ``free_space_task`` adds what other views see through to where the
+static model fails; ``settle_task`` finds what moves and its outline; ``observe_task`` asks the cameras of the
+instant for the depth of each region; ``smooth_over_time`` makes that one over time; ``moving_depth_task``
+writes it.
 """
 
 from __future__ import annotations
@@ -15,15 +17,15 @@ from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
-from mvdyn_gtsam.refinement.initial import moving_regions, regions, static_residual
+from mvdyn_gtsam.refinement.free_space import DepthView, seen_through, without_outlines
+from mvdyn_gtsam.refinement.initial import closed, moving_regions, regions, static_residual
 from mvdyn_gtsam.refinement.moving_depth import (
     InstantView,
     RegionDepth,
-    commonest,
     link,
+    observed_depth,
     region_depth,
     smooth_over_time,
-    support,
 )
 from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
 
@@ -42,15 +44,62 @@ FEET = 0.1
 """Lowest share of a thing's height at which it touches the ground."""
 GROUND_ROWS = 2
 """Rows of the view below it that are the ground."""
+FREE_SPACE_RASTER = 2
+"""Pixels of the view between those asked whether others see through them. Source: time; things are
+larger."""
+SETTLED = 0.3
+"""Trust in its depth from which a point must be where it seems or else move. Source: of the points seen
+through in three rendered scenes, most of the moving ones had more and most of the still ones less."""
+SETTLED_SHARE = 0.25
+"""Of a region's points seen through that must have it. Source: 0.1 to 0.5 compared there."""
+MARGIN = 9
+"""Side of the square by which moving regions of other cameras grow before they deny a depth, px of the view.
+Source: choice, what their outlines err by."""
 LABELS = "labels"
 """The array of moving regions, numbered from 1 in every frame."""
 
 
-def settle_task(context: Context, frame: Frame) -> list[RegionDepth]:
-    """What moves in a frame, by the vote of the frames around it, and the depth of what stands still.
+def free_space_task(context: Context, frame: Frame) -> None:
+    """Add to where the static model fails in a frame what other times and cameras see through."""
+    workspace, config, wTc = context.workspace, context.config, context.poses()
+    (camera, time), view = frame, workspace.views[frame[0]]
+    offsets = [sign * offset for offset in config.witness_offsets for sign in (-1, 1)]
+    others = [(camera, time + offset) for offset in offsets]
+    others += [
+        (other, time + offset)
+        for other in context.group_of(camera)
+        if other != camera
+        for offset in (0, *offsets)
+    ]
+    views = [
+        DepthView(
+            context.image("first", j),
+            context.trust(j),
+            workspace.views[j[0]].intrinsics,
+            invert_pose(wTc[j]) @ wTc[frame],
+        )
+        for j in others
+        if 0 <= j[1] < workspace.frame_count
+    ]
+    theta = context.image("first", frame)
+    every = (slice(FREE_SPACE_RASTER // 2, None, FREE_SPACE_RASTER),) * 2
+    rays = view.rays.reshape(*view.shape, 3)[every]
+    through = seen_through(theta[every].ravel(), rays.reshape(-1, 3), views).reshape(rays.shape[:2])
+    marked, settled = (
+        cv2.resize(mask.astype(np.uint8), view.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        for mask in (without_outlines(through), through & (context.trust(frame)[every] > SETTLED))
+    )
+    found = regions(closed(marked, config), config)
+    for label in range(1, int(found.max()) + 1):
+        region = (found == label) & (marked > 0)
+        # where the flow says nothing a depth may be wrong without any motion
+        if settled[region].mean() < SETTLED_SHARE:
+            found[found == label] = 0
+    workspace.write("fails", frame, np.maximum(np.asarray(workspace.read("fails", frame)), found > 0))
 
-    Returns what the views of the frame's instant say of each moving region.
-    """
+
+def settle_task(context: Context, frame: Frame) -> None:
+    """What moves in a frame, by the vote of the frames around it, and the depth of what stands still."""
     workspace, config = context.workspace, context.config
     edges = context.edges(frame, context.poses(), own_camera=True)
     theta = context.image("first", frame)
@@ -59,6 +108,7 @@ def settle_task(context: Context, frame: Frame) -> list[RegionDepth]:
     labels = moving_regions(np.asarray(workspace.read("fails", frame)), near, votes, config)
     # flow that a static depth explains is the best evidence against motion
     explained = static_residual(np.exp(theta), edges) < config.moving_px
+    explained &= np.asarray(workspace.read("fails", frame)) == 0
     around = grown(labels > 0, config) & ~explained | (labels > 0)
     trust = context.trust(frame)
     trust[around] = 0.0
@@ -74,7 +124,36 @@ def settle_task(context: Context, frame: Frame) -> list[RegionDepth]:
     workspace.write("prior", frame, theta)
     workspace.write("prior_weight", frame, np.maximum(trust, 1e-3) / np.float32(config.prior_sigma**2))
     workspace.write(LABELS, frame, labels.astype(np.uint8))
-    return _observed(context, frame, labels)
+
+
+def observe_task(context: Context, frame: Frame) -> list[RegionDepth]:
+    """What the other cameras of the instant say of each moving region of a frame."""
+    workspace, wTc = context.workspace, context.poses()
+    labels = np.asarray(workspace.read(LABELS, frame))
+    others = [(camera, frame[1]) for camera in context.group_of(frame[0]) if camera != frame[0]]
+    if not others or not labels.any():
+        return []
+    views = [
+        InstantView(
+            grey=context.luminance(j),
+            intrinsics=workspace.views[j[0]].intrinsics,
+            jTi=invert_pose(wTc[j]) @ wTc[frame],
+            theta=context.image("prior", j),
+            moves=_with_margin(np.asarray(workspace.read(LABELS, j)) > 0),
+        )
+        for j in others
+    ]
+    grey, instant = context.luminance(frame), context.image("instant", frame)
+    rays = workspace.views[frame[0]].rays
+    return [
+        RegionDepth(frame, label, *observed_depth(instant, labels == label, grey, rays, views))
+        for label in range(1, int(labels.max()) + 1)
+    ]
+
+
+def _with_margin(mask: Mask) -> Mask:
+    """``mask (h, w)`` and its surroundings: an outline is right to some pixels."""
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8)) > 0)
 
 
 def depth_of_regions(
@@ -82,7 +161,7 @@ def depth_of_regions(
 ) -> list[dict[int, float]]:
     """Log inverse depth by label of the moving regions of each of ``frames``, those that can be believed.
 
-    ``found`` is what ``settle_task`` returned for each.
+    ``found`` is what ``observe_task`` returned for each.
     """
     regions_found = [region for each in found for region in each]
     number = {(region.frame, region.label): k for k, region in enumerate(regions_found)}
@@ -128,26 +207,6 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, float]]) -> 
     workspace.write("prior_weight", frame, weight)
     workspace.write("moving", frame, moving)
     workspace.write("begun", frame, np.exp(theta))
-
-
-def _observed(context: Context, frame: Frame, labels: Labels) -> list[RegionDepth]:
-    """What the other cameras of the instant say of each region."""
-    workspace, wTc = context.workspace, context.poses()
-    others = [(camera, frame[1]) for camera in context.group_of(frame[0]) if camera != frame[0]]
-    if not others or not labels.any():
-        return []
-    views = [
-        InstantView(context.luminance(j), workspace.views[j[0]].intrinsics, invert_pose(wTc[j]) @ wTc[frame])
-        for j in others
-    ]
-    grey, instant = context.luminance(frame), context.image("instant", frame)
-    rays = workspace.views[frame[0]].rays
-    found = []
-    for label in range(1, labels.max() + 1):
-        depth = commonest(instant, labels == label)
-        evidence = support(grey, labels == label, depth, rays, views)
-        found.append(RegionDepth(frame, label, depth, evidence))
-    return found
 
 
 def standing(theta: Float32, region: Mask) -> Float32:

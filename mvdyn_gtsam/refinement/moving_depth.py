@@ -2,7 +2,7 @@
 
 The views of one instant tell a moving region's depth, but only where they see it, and not always rightly. A
 thing does not jump: regions of consecutive frames that overlap are the same thing, and its depth changes
-slowly. So every region gets a depth from its own observation and those before and after, each counting as far
+evenly. So every region gets a depth from its own observation and those before and after, each counting as far
 as the images of its instant support it.
 """
 
@@ -20,6 +20,7 @@ from scipy.sparse.linalg import spsolve
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.free_space import depth_beyond
 from mvdyn_gtsam.refinement.views import pixels_seen
 
 Array = npt.NDArray[np.float64]
@@ -39,14 +40,22 @@ NO_SUPPORT, FULL_SUPPORT = 0.08, 0.2
 0.07 to 0.13, right ones 0.15 to 0.3."""
 SCATTER = 0.05
 """Error of an observed log depth that is common. Source: 0.05 to 0.2 compared on two scenes."""
-CHANGE_PER_STEP = 0.05
-"""Change of log depth between consecutive frames that is common: 3 m/s at 2 m and 30 frames per second.
-Source: 0.01 to 0.2 compared on two scenes."""
+CHANGE_PER_STEP = 0.2
+"""Change of log depth between consecutive frames that is possible. Source: 0.05 to 0.3 compared on three
+scenes; it only bounds what ``CHANGE_OF_SPEED`` continues."""
+CHANGE_OF_SPEED = 0.004
+"""Change of that change from one frame to the next that is common: 7 m/s^2 at 2 m and 30 frames per second.
+Source: 0.002 to 0.02 and none compared on three scenes."""
 LEAST_OVERLAP = 0.2
 """Of two regions of consecutive frames that are one thing: shared pixels over those of the smaller."""
 FADING_STEPS = 24.0
 """Frames after which another frame's evidence counts 1/e."""
 ITERATIONS = 10
+HIDDEN = 0.15
+"""Log of the depth of a point over that of what a view sees there from which on it is hidden from it. Source:
+as ``free_space.BEHIND``."""
+LEAST_SHARE = 0.1
+"""Of a region's pixels whose own depth is not denied, for these to decide. Source: choice."""
 
 
 @dataclass(frozen=True)
@@ -71,16 +80,49 @@ class InstantView:
     """``(3, 3)``"""
     jTi: Array
     """``(4, 4)``"""
+    theta: Float32
+    """``(h_j, w_j)`` log inverse depth of what stands still."""
+    moves: Mask
+    """``(h_j, w_j)`` where something moves, or near."""
 
 
-def commonest(instant: Float32, region: Mask) -> float:
-    """Log of the inverse depth that most pixels of ``region (h, w)`` have; ``instant (h, w)``."""
-    values = np.log(instant[region])
+def contradicted(theta: Float32, rays: Float32, views: Sequence[InstantView]) -> Mask:
+    """Which moving points at log inverse depth ``theta (M,)`` along ``rays (M, 3)`` a view denies, ``(M,)``.
+
+    It sees something at the instant that stands still, and not before the point: a moving thing seen by two
+    cameras moves in both.
+    """
+    denied = np.zeros(len(theta), bool)
+    for view in views:
+        farther, (row, column) = depth_beyond(theta, rays, view)
+        denied |= (farther > -HIDDEN) & ~view.moves[row, column]
+    return denied
+
+
+def commonest(values: Float32) -> float:
+    """Log of the inverse depth that most of ``values (M,)`` have."""
     edges = np.arange(values.min() - BIN, values.max() + 2.0 * BIN, BIN)
     histogram = np.histogram(values, edges)[0]
     around = np.convolve(histogram, np.ones(3), "same")
     centre = edges[around.argmax()] + 0.5 * BIN
     return float(np.median(values[np.abs(values - centre) < TOLERANCE]))
+
+
+def observed_depth(
+    instant: Float32, region: Mask, grey: Float32, rays: Float32, views: Sequence[InstantView]
+) -> tuple[float, float]:
+    """Log inverse depth of ``region (h, w)`` that most of its pixels have in ``instant (h, w)``, and the
+    evidence for it in [0, 1]: how alike the images are there, less what a view denies.
+
+    ``grey (h, w)`` is the image and ``rays (h w, 3)`` those of its pixels.
+    """
+    values, own = np.log(instant[region]), rays[region.ravel()]
+    kept = ~contradicted(values, own, views)
+    if kept.mean() > LEAST_SHARE:
+        values = values[kept]
+    depth = commonest(values)
+    denied = contradicted(np.full(len(own), depth, np.float32), own, views).mean()
+    return depth, support(grey, region, depth, rays, views) * (1.0 - float(denied))
 
 
 def region_depth(instant: Float32, region: Mask, log_inverse_depth: float) -> Float32:
@@ -139,6 +181,14 @@ def smooth_over_time(regions: Sequence[RegionDepth], links: Sequence[tuple[int, 
         (np.tile([1.0, -1.0], len(ends)), (rows, ends.ravel())), shape=(len(ends), count)
     )
     stiffness = difference.T @ difference / CHANGE_PER_STEP**2
+    starts, stops = (
+        sparse.csr_array((np.ones(len(ends)), (np.arange(len(ends)), end)), shape=(len(ends), count))
+        for end in ends.T
+    )
+    # consecutive links: one stops where the next starts
+    first, second = (stops @ starts.T).nonzero()
+    bend = difference[first] - difference[second]
+    stiffness = stiffness + bend.T @ bend / CHANGE_OF_SPEED**2
     solved, weight = observed, evidence
     for _ in range(ITERATIONS):
         # without any evidence a region keeps what it saw

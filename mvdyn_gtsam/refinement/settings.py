@@ -130,6 +130,9 @@ class RefinementConfig:
     """Gaps in a moving region up to this share of the image's width are closed. Source: choice."""
     moving_share: float = 0.4
     """Share of the frames around that must see the static model fail. Source: choice."""
+    witness_offsets: tuple[int, ...] = (12, 24, 40)
+    """Distances in frames, both ways, of the views, of all cameras, that are asked whether they see through
+    what passes for still. Source: choice; beyond the reach of the flow."""
     moving_reach: float = 0.06
     """How far outside such a region its outline is looked for, as a share of the image's width. Source:
     compared on three_cameras and dynamic_human, 0.02 to 0.1; no sweep is kept."""

@@ -131,6 +131,7 @@ class Refinement:
                 self._step("phase 1", self._align)
             if config.phase2:
                 self._step("begin", lambda: self._map("begin", self._frames))
+                self._step("free space", lambda: self._map("free space", self._frames))
                 self._step("settle", self._settle)
                 self._depth = "begun"
                 self._solve_depth(FIRST_DEPTH, min(GUIDE_STEPS, config.depth_iterations))
@@ -199,11 +200,12 @@ class Refinement:
 
     def _settle(self) -> None:
         """What moves, and the depth that phase 2 begins with."""
+        self._map("settle", self._frames)
         found: list[list[RegionDepth]] = []
-        for done, regions in enumerate(self._pool.map("settle", self._frames)):
+        for done, regions in enumerate(self._pool.map("observe", self._frames)):
             assert isinstance(regions, list)
             found.append(regions)
-            self._progress.update("refine: settle", done + 1, len(self._frames))
+            self._progress.update("refine: observe", done + 1, len(self._frames))
         depths = depth_of_regions(self._context, self._frames, found)
         self._map("moving depth", list(zip(self._frames, depths, strict=True)))
 

@@ -27,7 +27,7 @@ from mvdyn_gtsam.refinement.initial import (
     static_residual,
 )
 from mvdyn_gtsam.refinement.measurement import measure_pair, sweep_frame
-from mvdyn_gtsam.refinement.motion import moving_depth_task, settle_task
+from mvdyn_gtsam.refinement.motion import free_space_task, moving_depth_task, observe_task, settle_task
 from mvdyn_gtsam.refinement.planes import PlainRegion, fill_plain, plain_regions, planes_in_world
 from mvdyn_gtsam.refinement.samples import FrameSample
 
@@ -296,7 +296,9 @@ TASKS = {
     "temporal flow": temporal_flow_task,
     "wide flow": wide_flow_task,
     "begin": begin_task,
+    "free space": free_space_task,
     "settle": settle_task,
+    "observe": observe_task,
     "moving depth": moving_depth_task,
     "window": window_task,
     "planes": planes_task,

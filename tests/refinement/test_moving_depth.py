@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from mvdyn_gtsam.capture.model import Camera
@@ -12,16 +13,21 @@ from mvdyn_gtsam.refinement.moving_depth import (
     InstantView,
     RegionDepth,
     commonest,
+    contradicted,
     link,
+    observed_depth,
     region_depth,
     smooth_over_time,
     support,
 )
 from mvdyn_gtsam.refinement.views import DenseView
 
+Mask = npt.NDArray[np.bool_]
+
 SHAPE = (60, 80)
 REGION = np.zeros(SHAPE, bool)
 REGION[20:40, 30:50] = True
+EVERYWHERE = np.ones(SHAPE, bool)
 VIEW = DenseView.of(Camera("cam0", 80, 60, 70.0, 70.0, 39.5, 29.5), 1.0)
 INTRINSICS, RAYS = VIEW.intrinsics, VIEW.rays
 
@@ -33,7 +39,7 @@ def test_a_region_takes_its_commonest_depth() -> None:
     values[:80] = rng.uniform(0.1, 0.3, 80)
     values[80:140] = rng.uniform(0.7, 2.0, 60)
     instant[REGION] = values
-    common = commonest(instant, REGION)
+    common = commonest(np.log(instant[REGION]))
     assert np.exp(common) == pytest.approx(0.5, rel=0.02)
     depth = region_depth(instant, REGION, common)
     np.testing.assert_allclose(depth[140:], values[140:], rtol=1e-5)
@@ -42,7 +48,7 @@ def test_a_region_takes_its_commonest_depth() -> None:
 
 @pytest.mark.parametrize("value", [0.01, 0.3, 0.5, 1.0, 7.3])
 def test_a_region_of_one_depth_has_that(value: float) -> None:
-    assert np.exp(commonest(np.full(SHAPE, value, np.float32), REGION)) == pytest.approx(value)
+    assert np.exp(commonest(np.full(400, np.log(value), np.float32))) == pytest.approx(value)
 
 
 def textured(seed: int = 0) -> Float32:
@@ -50,11 +56,12 @@ def textured(seed: int = 0) -> Float32:
     return np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.6), np.float32)
 
 
-def beside(grey: Float32, shift: int) -> InstantView:
-    """A camera that sees what is 2 m away ``shift`` px farther to the left."""
+def beside(grey: Float32, shift: int, moves: Mask = EVERYWHERE) -> InstantView:
+    """A camera that sees what is 2 m away ``shift`` px farther to the left, before a wall 5 m away."""
     jTi = np.eye(4)
     jTi[0, 3] = -shift * 2.0 / 70.0
-    return InstantView(np.roll(grey, -shift, axis=1), INTRINSICS, jTi)
+    wall = np.full(SHAPE, np.log(0.2), np.float32)
+    return InstantView(np.roll(grey, -shift, axis=1), INTRINSICS, jTi, wall, moves)
 
 
 def test_the_right_depth_is_supported_and_a_wrong_one_is_not() -> None:
@@ -69,6 +76,42 @@ def test_what_another_camera_does_not_see_is_not_supported() -> None:
     grey = textured()
     assert support(grey, REGION, np.log(0.5), RAYS, [beside(grey, 70)]) == 0.0
     assert support(grey, REGION, np.log(0.5), RAYS, []) == 0.0
+
+
+def denied_share(depth: float, view: InstantView) -> float:
+    rays = RAYS[REGION.ravel()]
+    return float(contradicted(np.full(len(rays), -np.log(depth), np.float32), rays, [view]).mean())
+
+
+def test_a_moving_thing_moves_in_both_cameras() -> None:
+    """At 2 m the other camera sees it 8 px to the left, where it moves; at 1 m 16 px, where nothing does."""
+    view = beside(textured(), 8, np.roll(REGION, -8, axis=1))
+    assert denied_share(2.0, view) == 0.0
+    assert denied_share(1.0, view) == pytest.approx(8.0 / 20.0)
+    assert denied_share(0.55, view) == 1.0
+
+
+def test_what_is_hidden_or_outside_is_not_denied() -> None:
+    nothing_moves = beside(textured(), 8, ~EVERYWHERE)
+    assert denied_share(4.0, nothing_moves) == 1.0
+    assert denied_share(8.0, nothing_moves) == 0.0
+    assert denied_share(0.1, nothing_moves) == 0.0
+
+
+def test_the_observed_depth_is_one_that_no_camera_denies() -> None:
+    """Two thirds of the pixels agree on a depth where the other camera sees nothing move."""
+    grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
+    instant[20:33] = 2.5
+    view = beside(grey, 8, np.roll(REGION, -8, axis=1))
+    found, evidence = observed_depth(instant, REGION, grey, RAYS, [view])
+    assert np.exp(found) == pytest.approx(0.5, rel=0.02)
+    assert evidence == 1.0
+
+
+def test_a_depth_that_is_denied_is_no_evidence() -> None:
+    grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
+    assert observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8)])[1] == 1.0
+    assert observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8, ~EVERYWHERE)])[1] == 0.0
 
 
 def test_regions_that_overlap_are_one_thing() -> None:
@@ -99,7 +142,8 @@ def test_frames_without_evidence_take_it_from_the_nearest_with() -> None:
     unseen = {t: 0.0 for t in range(8)}
     regions = walk(20, {t: 1.0 for t in range(8)}, unseen)
     solved, belief = smooth_over_time(regions, chain(20))
-    np.testing.assert_allclose(solved[:8], -0.08, atol=0.05)
+    # it walks evenly, also before anybody saw it
+    np.testing.assert_allclose(solved, -0.01 * np.arange(20), atol=0.02)
     assert (np.diff(belief[:8]) > 0.0).all()
 
 
