@@ -145,9 +145,9 @@ class TrackingConfig:
     """Median change of a guided flow's prediction beyond which the polish measures it again, px. Source:
     measured: 0.3, 0.5 and 1.0 gave 25.2, 25.2 and 25.1 mm on hololens_office_2seg; on dynamic_human
     0.3 gave 2.4 mm and 1.0 gave 2.6."""
-    polish_tolerance: float = 1e-6
+    polish_tolerance: float = 1e-5
     """Relative decrease of the cost at which a solve of the polish ends. Source: choice; 1e-4 ended
-    far from the minimum."""
+    far from the minimum, and 1e-6 iterated on without moving the poses."""
     image_cache_mb: int = 128
     """Memory for frames held or read again. Source: choice, 200 frames of 512x384."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 
@@ -16,6 +17,7 @@ from mvdyn_gtsam.frontend.dense_depth import upsample_depth
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, DisFlow
 from mvdyn_gtsam.frontend.dense_map import testimony_flow
 from mvdyn_gtsam.frontend.start import Start, start_from_arrays, start_to_arrays
+from mvdyn_gtsam.frontend.threads import in_order
 from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer, WideBaselineInitializer
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction import CaptureInfo, Reconstruction, ReconstructionWriter
@@ -121,9 +123,9 @@ def _track(
             writer.write_trajectory(capture.cameras[camera].name, capture.timestamps, wTc[camera])
     _write_diagnostics(capture, result, writer)
     total = capture.frame_count * len(capture.cameras)
-    for done, depth in enumerate(tracker.frame_depths()):
-        _write_depth(capture, depth, result, writer)
-        progress.update("depth", done + 1, total, capture.cameras[depth.camera].name)
+    jobs = (_depth_job(capture, depth, result, writer) for depth in tracker.frame_depths())
+    for done, name in enumerate(in_order(jobs)):
+        progress.update("depth", done + 1, total, name)
     writer.finish_stage("tracking", perf_counter() - began)
 
 
@@ -187,19 +189,28 @@ def _tracked(capture: Capture, writer: ReconstructionWriter) -> Tracked:
     )
 
 
-def _write_depth(
+def _depth_job(
     capture: Capture, depth: FrameDepth, result: TrackingResult, writer: ReconstructionWriter
-) -> None:
+) -> Callable[[], str]:
+    """Brings one frame's depth to the input's resolution, writes it and returns its camera's name.
+
+    The image is read here and now: cameras are read by one thread at a time.
+    """
     name = capture.cameras[depth.camera].name
     if writer.has_depth(name, depth.time):
-        return
+        return lambda: name
     image = capture.read(depth.camera, depth.time)
-    # Information of a point's log depth is the inverse variance: confidence falls to a half at 5 % error.
-    weight = depth.information / (depth.information + 0.05**-2)
-    dense, confidence = upsample_depth(
-        image, result.grids[depth.camera], np.exp(depth.log_depth), np.maximum(weight, 1e-6)
-    )
-    writer.write_depth(name, depth.time, dense, confidence)
+
+    def write() -> str:
+        # Information of a point's log depth is the inverse variance: confidence falls to a half at 5 % error.
+        weight = depth.information / (depth.information + 0.05**-2)
+        dense, confidence = upsample_depth(
+            image, result.grids[depth.camera], np.exp(depth.log_depth), np.maximum(weight, 1e-6)
+        )
+        writer.write_depth(name, depth.time, dense, confidence)
+        return name
+
+    return write
 
 
 def _write_diagnostics(capture: Capture, result: TrackingResult, writer: ReconstructionWriter) -> None:

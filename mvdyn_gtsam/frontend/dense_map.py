@@ -93,6 +93,8 @@ def testimony_flow(config: FlowConfig) -> FlowConfig:
 
 
 Flows = dict[int, GridFlow]
+RoughViews = dict[int, tuple[Image, Float32]]
+"""Grey image and interpolated depth by frame of the map."""
 
 
 def densify_map(capture: Capture, camera_map: CameraMap, flow: DenseFlow, config: DenseMapConfig) -> DenseMap:
@@ -102,9 +104,10 @@ def densify_map(capture: Capture, camera_map: CameraMap, flow: DenseFlow, config
     count = len(camera_map.times)
     chosen = np.unique(np.linspace(0, count - 1, min(count, config.frames)).round().astype(int))
     views, explained, measured = [], 0.0, 0.0
+    rough: RoughViews = {}
     for frame in chosen:
-        flows = _measure_flows(capture, camera_map, int(frame), grid, flow, config)
-        view, fitting, total = _depth_view(capture, camera_map, int(frame), grid, flows, config)
+        flows = _measure_flows(capture, camera_map, int(frame), grid, flow, config, rough)
+        view, fitting, total = _depth_view(camera, camera_map, int(frame), grid, flows, rough[frame], config)
         views.append(view)
         explained += fitting
         measured += total
@@ -118,22 +121,24 @@ def _measure_flows(
     grid: Grid,
     flow: DenseFlow,
     config: DenseMapConfig,
+    rough: RoughViews,
 ) -> Flows:
-    """Flow of one frame to the map's frames before and after it."""
+    """Flow of one frame to the map's frames before and after it; ``rough`` holds those views afterwards."""
     camera = capture.cameras[camera_map.camera]
     last = len(camera_map.times) - 1
     span = range(max(0, frame - config.neighbours), min(last, frame + config.neighbours) + 1)
 
-    def view(index: int) -> tuple[Image, Float32]:
-        image = to_grey(capture.read(camera_map.camera, int(camera_map.times[index])))
-        return image, _sparse_depth(camera_map, index, camera)
-
-    views = {index: view(index) for index in span}
+    for passed in set(rough) - set(span):
+        del rough[passed]
+    for index in span:
+        if index not in rough:
+            image = to_grey(capture.read(camera_map.camera, int(camera_map.times[index])))
+            rough[index] = image, _sparse_depth(camera_map, index, camera)
     others = [other for other in span if other != frame]
 
     def measure(other: int) -> GridFlow:
         jTi = invert_pose(camera_map.mTc[other]) @ camera_map.mTc[frame]
-        return _measure(views[frame], views[other], jTi, camera, grid, flow, config)
+        return _measure(rough[frame], rough[other], jTi, camera, grid, flow, config)
 
     return {other: measure(other) for other in others}
 
@@ -175,17 +180,18 @@ def _sparse_depth(camera_map: CameraMap, frame: int, camera: Camera) -> Float32:
 
 
 def _depth_view(
-    capture: Capture,
+    camera: Camera,
     camera_map: CameraMap,
     frame: int,
     grid: Grid,
     flows: Flows,
+    rough: tuple[Image, Float32],
     config: DenseMapConfig,
 ) -> tuple[DepthView, float, float]:
     """Dense depth of one frame; also the weight of its flow that fits, and of all of it."""
-    camera = capture.cameras[camera_map.camera]
+    grey, rough_depth = rough
     neighbours = list(flows)
-    start = np.log(np.maximum(grid.sample(_sparse_depth(camera_map, frame, camera)), 1e-6)).astype(np.float64)
+    start = np.log(np.maximum(grid.sample(rough_depth), 1e-6)).astype(np.float64)
     measurement = StructurelessMeasurement(
         rays=pixel_rays(grid.pixels, camera.intrinsics),
         initial_log_depth=start,
@@ -205,14 +211,12 @@ def _depth_view(
     measured = weight.sum(0)
     sigma = config.flow_sigma_px / np.sqrt(np.maximum(information, 1e-12))
     sure = (sigma < config.depth_sigma) & (fitting > 0.5 * measured) & (measured > 0.5)
-    time = int(camera_map.times[frame])
-    grey = cv2.cvtColor(capture.read(camera_map.camera, time), cv2.COLOR_RGB2GRAY).astype(np.float32)
     view = DepthView(
-        time=time,
+        time=int(camera_map.times[frame]),
         mTc=mTi,
         intrinsics=camera.intrinsics,
         grid=grid,
         depth=np.where(sure, np.exp(log_depth), np.nan),
-        image=cv2.GaussianBlur(grey, (0, 0), 0.35 * config.stride),
+        image=cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 0.35 * config.stride),
     )
     return view, float(fitting.sum()), float(measured.sum())

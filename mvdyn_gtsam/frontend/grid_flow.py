@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mvdyn_gtsam.frontend.dense_flow import Float32, FlowConfig, GridFlow, Image, inside
+from mvdyn_gtsam.frontend.dense_flow import Float32, FlowConfig, GridFlow, Image, inside, pixel_raster
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.geometry import invert_pose
 
 Array = npt.NDArray[np.float64]
 
 NOWHERE = np.float32(-1e7)
-"""Where the target of a pixel is unknown: so far out that no interpolation with it falls into an image."""
+"""Flow of a pixel whose target is unknown: so far out that no interpolation with it falls into an image."""
 
 
 @runtime_checkable
@@ -53,22 +53,23 @@ class GridView:
 
 @dataclass(frozen=True)
 class _OneWay:
-    """One direction: ``residual`` leads from pixel x to where ``seed`` (if any) is to be read."""
+    """One direction, at the resolution the flow was measured at ("small"): ``residual`` leads from pixel x to
+    where ``seed`` (if any) is to be read."""
 
     residual: Float32
-    """``(H_i, W_i, 2)`` px"""
+    """``(h_i, w_i, 2)`` small px"""
     seed: Float32 | None
-    """``(H_i, W_i, 2)`` predicted position in image j, ``NOWHERE`` where unknown."""
+    """``(h_i, w_i, 2)`` small px: predicted flow, ``NOWHERE`` where unknown."""
+    small_i: Image
+    small_j: Image
+    size_i: tuple[int, ...]
     size_j: tuple[int, ...]
-    """height, width of image j"""
+    """height, width of the whole images"""
 
-    def follow(self, pixels: Float32, residual: Float32) -> tuple[Float32, npt.NDArray[np.bool_]]:
-        """Positions in image j of ``pixels (R, C, 2)`` with the given ``residual``, and where known."""
+    def follow(self, pixels: Float32, residual: Float32) -> Float32:
+        """Positions in j of ``pixels (R, C, 2)`` with the given ``residual``; far outside where unknown."""
         moved = pixels + residual
-        if self.seed is None:
-            return moved, np.ones(moved.shape[:2], bool)
-        target = _bilinear(self.seed, moved)
-        return target, inside(target, self.size_j, 0)
+        return moved if self.seed is None else moved + _bilinear(self.seed, moved)
 
 
 def measure_grid(
@@ -80,8 +81,10 @@ def measure_grid(
     """
     if grey_i.shape != grey_j.shape:
         raise ValueError(f"images of {grey_i.shape} and {grey_j.shape} pixels need a seed for their flow")
-    forward = _OneWay(flow.flow(grey_i, grey_j), None, grey_j.shape)
-    backward = _OneWay(flow.flow(grey_j, grey_i), None, grey_i.shape)
+    forward, backward = (
+        _OneWay(flow.flow(a, b), None, a, b, a.shape, b.shape)
+        for a, b in ((grey_i, grey_j), (grey_j, grey_i))
+    )
     return (
         _sampled(forward, backward, grid_i, flow.config),
         _sampled(backward, forward, grid_j, flow.config),
@@ -98,8 +101,9 @@ def measure_grid_seeded(
     seed_j: Float32,
 ) -> tuple[GridFlow, GridFlow]:
     """Flow on top of a predicted ``seed_i (H_i, W_i, 2)`` and ``seed_j (H_j, W_j, 2)`` px, NaN = unknown."""
-    forward = _seeded(flow, grey_i, grey_j, _positions(seed_i))
-    backward = _seeded(flow, grey_j, grey_i, _positions(seed_j))
+    level = flow.config.finest_scale
+    forward = _seeded(flow, grey_i, grey_j, _small_seed(seed_i, grey_j.shape, level))
+    backward = _seeded(flow, grey_j, grey_i, _small_seed(seed_j, grey_i.shape, level))
     return (
         _sampled(forward, backward, grid_i, flow.config),
         _sampled(backward, forward, grid_j, flow.config),
@@ -116,32 +120,31 @@ def guide_grid(
     config: FlowConfig,
 ) -> tuple[GridFlow, GridFlow]:
     """``guided_flow`` at the grids of both views, whose depths and relative pose are known roughly."""
-    iTj = invert_pose(jTi)
-    forward = _seeded(flow, grey_i, grey_j, predict_targets(view_i, view_j, jTi))
-    backward = _seeded(flow, grey_j, grey_i, predict_targets(view_j, view_i, iTj))
+    level, iTj = flow.config.finest_scale, invert_pose(jTi)
+    forward = _seeded(flow, grey_i, grey_j, predict_grid_flow(view_i, view_j, jTi, level))
+    backward = _seeded(flow, grey_j, grey_i, predict_grid_flow(view_j, view_i, iTj, level))
     results = []
-    for one, other, grey_a, grey_b, view_a, view_b, bTa in (
-        (forward, backward, grey_i, grey_j, view_i, view_j, jTi),
-        (backward, forward, grey_j, grey_i, view_j, view_i, iTj),
+    for one, other, view_a, view_b, bTa in (
+        (forward, backward, view_i, view_j, jTi),
+        (backward, forward, view_j, view_i, iTj),
     ):
         sampled = _sampled(one, other, view_a.grid, flow.config)
-        weight = _look_weight(one, grey_a, grey_b, view_a.grid, config)
+        weight = _look_weight(one, view_a.grid, config)
         weight *= _occlusion_weight(sampled.target, view_a, view_b, bTa, config)
         results.append(GridFlow(sampled.target, sampled.weight * weight))
     return results[0], results[1]
 
 
-def predict_targets(view_i: GridView, view_j: GridView, jTi: Array) -> Float32:
-    """``(H_i, W_i, 2)``: where a static scene puts every pixel of view i in view j, ``NOWHERE`` if behind.
+def predict_grid_flow(view_i: GridView, view_j: GridView, jTi: Array, level: int) -> Float32:
+    """``(h_i, w_i, 2)``: static flow in pixels of images halved ``level`` times, ``NOWHERE`` behind camera j.
 
-    The grid is projected and what lies between interpolated: bending over one cell is far less than the
-    flow on top corrects.
+    The grid is projected and the flow between its points interpolated: bending over one cell is far less
+    than the flow on top corrects.
     """
     grid, stride = view_i.grid, view_i.grid.stride
     rows, cols = grid.shape
     depth = np.pad(view_i.depth.reshape(rows, cols), 1, mode="edge")
-    # cv2.resize puts nodes in the middle of their cells: half a pixel before the grid's for an even stride
-    first = grid.pixels[0] - stride - (0.5 if stride % 2 == 0 else 0.0)
+    first = grid.pixels[0] - stride
     x = first[0] + stride * np.arange(cols + 2.0)
     y = first[1] + stride * np.arange(rows + 2.0)[:, None]
     homography = view_j.intrinsics @ jTi[:3, :3] @ np.linalg.inv(view_i.intrinsics)
@@ -149,42 +152,66 @@ def predict_targets(view_i: GridView, view_j: GridView, jTi: Array) -> Float32:
     u, v, z = (depth * (a * x + b * y + c) + e for (a, b, c), e in zip(homography, epipole, strict=True))
     front = z > 1e-6 * depth
     scale = np.divide(1.0, z, out=np.zeros_like(z), where=front)
-    table = np.where(front[..., None], np.stack([u * scale, v * scale], axis=-1), NOWHERE)
+    (width_i, height_i), (width_j, height_j) = _halved(view_i.size, level), _halved(view_j.size, level)
+    at_x, at_y = _to_small(x, width_i, view_i.size[0]), _to_small(y, height_i, view_i.size[1])
+    table = np.empty((rows + 2, cols + 2, 2), np.float32)
     # far out and unknown are the same, and interpolation must not overflow
-    table = np.maximum(np.minimum(table, -NOWHERE), NOWHERE).astype(np.float32)
-    dense = cv2.resize(table, ((cols + 2) * stride, (rows + 2) * stride), interpolation=cv2.INTER_LINEAR)
-    left, top = (np.rint((stride - 1) / 2 - first)).astype(int)
-    width, height = view_i.size
-    return np.asarray(dense[top : top + height, left : left + width])
+    for k, (there, own) in enumerate(
+        (
+            (_to_small(u * scale, width_j, view_j.size[0]), at_x),
+            (_to_small(v * scale, height_j, view_j.size[1]), at_y),
+        )
+    ):
+        table[..., k] = np.where(front, np.clip(there - own, NOWHERE, -NOWHERE), NOWHERE)
+    wide = _between(table.transpose(1, 0, 2), at_x, width_i).transpose(1, 0, 2)
+    return np.ascontiguousarray(_between(wide, at_y[:, 0], height_i))
 
 
-def _positions(seed: Float32) -> Float32:
-    height, width = seed.shape[:2]
-    target = np.empty_like(seed)
-    np.add(seed[..., 0], np.arange(width, dtype=np.float32), out=target[..., 0])
-    np.add(seed[..., 1], np.arange(height, dtype=np.float32)[:, None], out=target[..., 1])
-    return np.nan_to_num(target, copy=False, nan=float(NOWHERE))
+def _between(table: Float32, positions: Array, length: int) -> Float32:
+    """``(length, ...)``: rows of ``table (R, ...)`` at even ``positions``, interpolated at 0, 1, ..."""
+    step = positions[1] - positions[0]
+    where = np.clip((np.arange(length) - positions[0]) / step, 0.0, len(positions) - 1.0)
+    low = np.minimum(where.astype(np.int64), len(positions) - 2)
+    share = (where - low).astype(np.float32).reshape(-1, *[1] * (table.ndim - 1))
+    result: Float32 = table[low] * (np.float32(1.0) - share)
+    result += table[low + 1] * share
+    return result
+
+
+def _halved(size: tuple[int, int], level: int) -> tuple[int, int]:
+    return size[0] >> level, size[1] >> level
+
+
+def _to_small(positions: Array, small: int, whole: int) -> Array:
+    """Along one axis, from pixels of ``whole`` of them to pixels of ``small``; centres are at integers."""
+    return (positions + 0.5) * (small / whole) - 0.5
+
+
+def _small_seed(seed: Float32, shape_j: tuple[int, ...], level: int) -> Float32:
+    """A predicted flow ``(H_i, W_i, 2)`` px, NaN = unknown, as that of images halved ``level`` times."""
+    small = _shrunk(np.nan_to_num(seed, nan=float(NOWHERE)), level)
+    (height_i, width_i), (height, width) = seed.shape[:2], small.shape[:2]
+    width_j, height_j = _halved((shape_j[1], shape_j[0]), level)
+    x, y = width_j / shape_j[1], height_j / shape_j[0]
+    small = small * np.array([x, y], np.float32)
+    # what images of different size add
+    small[..., 0] += ((np.arange(width) + 0.5) * (x * width_i / width - 1.0)).astype(np.float32)
+    small[..., 1] += ((np.arange(height) + 0.5) * (y * height_i / height - 1.0)).astype(np.float32)[:, None]
+    return small
 
 
 def _seeded(flow: OneWayFlow, grey_i: Image, grey_j: Image, seed: Float32) -> _OneWay:
-    """The flow never looks at levels finer than its finest: image j is warped at that level already."""
+    """The flow never looks at levels finer than its finest: all is done at that level."""
     level = flow.config.finest_scale
-    size_i = grey_i.shape[1], grey_i.shape[0]
     small_i, small_j = _shrunk(grey_i, level), _shrunk(grey_j, level)
-    target = seed
-    if level:
-        x, y = np.divide(small_j.shape[::-1], grey_j.shape[::-1])
-        target = cv2.transform(_shrunk(seed, level), np.array([[x, 0, 0.5 * x - 0.5], [0, y, 0.5 * y - 0.5]]))
+    target = seed + pixel_raster(seed.shape)
     height, width = small_j.shape
     warped = cv2.remap(small_j, target, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     seen = cv2.inRange(target, (-0.5, -0.5, 0.0, 0.0), (width - 0.5, height - 0.5, 0.0, 0.0))
     # Where nothing is known the image itself stands in: no residual there, and no false edges.
     cv2.copyTo(small_i, cv2.bitwise_not(seen), warped)
     residual = flow.flow(small_i, np.asarray(warped, np.uint8), level)
-    if level:
-        residual = cv2.multiply(residual, (*np.divide(size_i, small_i.shape[::-1]), 1.0, 1.0))
-        residual = np.asarray(cv2.resize(residual, size_i, interpolation=cv2.INTER_LINEAR), np.float32)
-    return _OneWay(residual, seed, grey_j.shape)
+    return _OneWay(residual, seed, small_i, small_j, grey_i.shape, grey_j.shape)
 
 
 def _shrunk(field: npt.NDArray[Any], level: int) -> npt.NDArray[Any]:
@@ -197,34 +224,46 @@ def _shrunk(field: npt.NDArray[Any], level: int) -> npt.NDArray[Any]:
 
 def _sampled(one: _OneWay, other: _OneWay, grid: Grid, config: FlowConfig) -> GridFlow:
     """Target and weight at the grid: seeded trust times agreement of the two directions, none at borders."""
-    height, width = one.residual.shape[:2]
+    scale_i, scale_j = _scale(one.small_i, one.size_i), _scale(one.small_j, one.size_j)
     pixels = grid.pixels.astype(np.float32).reshape(*grid.shape, 2)
-    residual = grid.sample(one.residual).reshape(pixels.shape)
-    target, known = one.follow(pixels, residual)
+    small = (pixels + np.float32(0.5)) * scale_i - np.float32(0.5)
+    residual = _bilinear(one.residual, small)
+    there = one.follow(small, residual)
+    target = (there + np.float32(0.5)) / scale_j - np.float32(0.5)
     margin = config.border_margin
-    known &= inside(target, one.size_j, margin) & inside(pixels, (height, width), margin)
-    reachable = np.where(known[..., None], target, np.float32(0.0))
-    returned, back_known = other.follow(reachable, _bilinear(other.residual, reachable))
-    known &= back_known
-    squared = _squared(returned - pixels) * np.float32(1.0 / config.forward_backward_sigma**2)
+    known = inside(target, one.size_j, margin) & inside(pixels, one.size_i, margin)
+    there = np.where(known[..., None], there, np.float32(0.0))
+    returned = other.follow(there, _bilinear(other.residual, there))
+    known &= inside(returned, one.small_i.shape, -0.5)
+    squared = _squared((returned - small) / scale_i)
+    squared *= np.float32(1.0 / config.forward_backward_sigma**2)
     if one.seed is not None:
-        squared += _squared(residual) * np.float32(1.0 / config.residual_limit**2)
+        squared += _squared(residual / scale_i) * np.float32(1.0 / config.residual_limit**2)
     weight = np.where(known, np.exp(-np.minimum(squared, 80.0)), np.float32(0.0))
     # what is unknown must still be finite
     target = np.where(np.abs(target) < 1e5, target, pixels)
     return GridFlow(target.reshape(-1, 2), weight.reshape(-1).astype(np.float32))
 
 
-def _look_weight(one: _OneWay, grey_i: Image, grey_j: Image, grid: Grid, config: FlowConfig) -> Float32:
+def _scale(small: Image, size: tuple[int, ...]) -> Float32:
+    """``(2,)`` x, y: small pixels per pixel."""
+    return np.array([small.shape[1] / size[1], small.shape[0] / size[0]], np.float32)
+
+
+def _look_weight(one: _OneWay, grid: Grid, config: FlowConfig) -> Float32:
     """``(N,)`` in [0, 1]: normalised cross-correlation of the windows around the grid's points."""
-    window, (rows, cols) = config.ncc_window, grid.shape
-    own = _windows(grey_i, grid, window).astype(np.float32)
-    offset = np.arange(window) - window // 2
-    pixels = np.empty((rows * window, cols * window, 2), np.float32)
-    pixels[..., 0] = (grid.pixels[:cols, 0, None] + offset).ravel()
-    pixels[..., 1] = (grid.pixels[::cols, 1, None] + offset).reshape(-1, 1)
-    target, _ = one.follow(pixels, _windows(one.residual, grid, window))
-    there = cv2.remap(grey_j, target, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    scale = _scale(one.small_i, one.size_i)
+    window, (rows, cols) = max(3, round(config.ncc_window * float(scale[0]))), grid.shape
+    height, width = one.small_i.shape
+    centre = (grid.pixels + 0.5) * scale - 0.5
+    x = _around(centre[:cols, 0], window, width)
+    y = _around(centre[::cols, 1], window, height)
+    chosen = np.ix_(y, x)
+    own = one.small_i[chosen].astype(np.float32)
+    pixels = np.empty((*own.shape, 2), np.float32)
+    pixels[..., 0], pixels[..., 1] = x, y[:, None]
+    target = one.follow(pixels, one.residual[chosen])
+    there = cv2.remap(one.small_j, target, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     there = there.astype(np.float32)
 
     def mean(field: Float32) -> Float32:
@@ -241,22 +280,10 @@ def _look_weight(one: _OneWay, grey_i: Image, grey_j: Image, grid: Grid, config:
     return weight.ravel()
 
 
-def _windows(field: npt.NDArray[Any], grid: Grid, window: int) -> npt.NDArray[Any]:
-    """The windows of ``(H, W[, C])`` around the grid's points side by side, ``(rows * window, cols * window
-    [, C])``; beyond the border its last pixel."""
-    before, after = window // 2, window - 1 - window // 2
-    first, last = grid.pixels[0].astype(int), grid.pixels[-1].astype(int)
-    height, width = field.shape[:2]
-    if min(first) < before or last[0] + after >= width or last[1] + after >= height:
-        field = np.asarray(cv2.copyMakeBorder(field, before, after, before, after, cv2.BORDER_REPLICATE))
-    else:
-        first = first - before
-    views = np.lib.stride_tricks.sliding_window_view(field, (window, window), (0, 1))
-    (rows, cols), stride = grid.shape, grid.stride
-    chosen = views[first[1] :: stride, first[0] :: stride][:rows, :cols]
-    # (rows, cols[, C], y, x) to (rows, y, cols, x[, C])
-    order = (0, 2, 1, 3) if field.ndim == 2 else (0, 3, 1, 4, 2)
-    return chosen.transpose(order).reshape(rows * window, cols * window, *field.shape[2:])
+def _around(centres: Array, window: int, length: int) -> npt.NDArray[np.int64]:
+    """``(K * window,)`` pixels of the windows around K ``centres`` of one axis, kept inside the image."""
+    first = np.rint(centres - 0.5 * (window - 1)).astype(np.int64)
+    return np.clip(first[:, None] + np.arange(window), 0, length - 1).ravel()
 
 
 def _occlusion_weight(
@@ -283,6 +310,6 @@ def _bilinear(field: Float32, positions: Float32) -> Float32:
     return np.asarray(found, np.float32)
 
 
-def _squared(vectors: Float32) -> Float32:
+def _squared(vectors: npt.NDArray[np.floating]) -> Float32:
     x, y = vectors[..., 0], vectors[..., 1]
     return np.asarray(x * x + y * y, np.float32)

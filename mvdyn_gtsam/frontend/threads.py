@@ -1,8 +1,14 @@
-"""How many threads to measure with."""
+"""Measuring side by side: with how many threads, and in which order."""
 
 from __future__ import annotations
 
 import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+Result = TypeVar("Result")
 
 
 def flow_threads() -> int:
@@ -13,3 +19,26 @@ def flow_threads() -> int:
         return int(first)
     # not everywhere: macOS has no affinity
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def in_order(jobs: Iterable[Callable[[], Result]], workers: int | None = None) -> Iterator[Result]:
+    """Results of ``jobs`` in their order, ``workers`` (default ``flow_threads()``) of them run side by side.
+
+    Jobs are taken from their iterable in the caller's thread, few ahead, for they hold images. What a job
+    raises is raised here; those after it may or may not have run.
+    """
+    workers = flow_threads() if workers is None else workers
+    if workers < 2:
+        yield from (job() for job in jobs)
+        return
+    running: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            for job in jobs:
+                running.append(pool.submit(job))
+                if len(running) > 2 * workers:
+                    yield running.popleft().result()
+            while running:
+                yield running.popleft().result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)

@@ -93,16 +93,22 @@ def measurement_of(
     steps: int = 4,
     thin: bool = False,
     robust_px: float | None = None,
+    measured: bool = False,
 ) -> StructurelessMeasurement:
     """The keyframe's flow to ``neighbours`` as the factor wants it.
 
-    ``thin`` takes every second grid point, as on a checkerboard; ``robust_px`` replaces the configured one.
+    ``thin`` takes every second grid point, as on a checkerboard; ``measured`` only those with a weight for
+    any neighbour: the others say nothing of poses. ``robust_px`` replaces the configured one.
     Robust scale and noise grow with the keyframe's own noise: blurred or fast frames are measured worse.
     Where ``tracking.depth_model`` fixes the shape of depth, that shape comes along.
     """
     view = views[keyframe.camera]
     flows = [keyframe.flows[frame] for frame in neighbours]
-    points = view.checkerboard if thin else slice(None)
+    points = view.checkerboard if thin else np.arange(len(view.rays))
+    if measured:
+        seen = np.any([flow.weight_steps[points] > 0 for flow in flows], axis=0)
+        # a measurement of no points at all would be a special case everywhere
+        points = points[seen] if seen.any() else points[:1]
     make: Callable[..., StructurelessMeasurement] = StructurelessMeasurement
     if config.depth_model != "structureless":
         make = partial(FixedShapeMeasurement, log_shape=_log_shape(keyframe, config)[points])

@@ -38,6 +38,9 @@ BYTES_PER_MEASUREMENT = 40
 """Of one point and edge in double precision: target, weight, information, and what they are made of."""
 LARGE = 800
 """Variables from which one sparse matrix is solved faster than GTSAM eliminates them one by one."""
+ROUGH = 10.0
+"""Times the tolerance with which a solve ends that more measuring follows: flow is measured anew only where
+its prediction has moved by ``remeasure_px``."""
 DAMPING = 1e-6
 """That Levenberg-Marquardt begins with."""
 
@@ -62,9 +65,11 @@ def solve_all(
 ) -> PolishSolve:
     """Levenberg-Marquardt over poses and depth scales of all ``keyframes``; they are updated in place.
 
-    ``thin`` uses every second grid point: enough between two rounds of measuring. ``mounts`` are held, their
-    relative poses being solved for.
+    ``thin`` uses every second grid point and ends early: enough between two rounds of measuring. ``mounts``
+    are held, their relative poses being solved for.
     """
+    if thin:
+        config = replace(config, polish_tolerance=ROUGH * config.polish_tolerance)
     graph, values = build_graph(keyframes, views, config, priors, thin, robust_px, mounts)
     before = graph.error(values)
     result, after, iterations = minimise(graph, values, before, config)
@@ -191,7 +196,14 @@ def build_graph(
         if neighbours:
             snapshot = replace(keyframe, flows=dict(keyframe.flows))
             measure: Callable[[], StructurelessMeasurement] = partial(
-                measurement_of, snapshot, neighbours, views, config, thin=thin, robust_px=robust_px
+                measurement_of,
+                snapshot,
+                neighbours,
+                views,
+                config,
+                thin=thin,
+                robust_px=robust_px,
+                measured=True,
             )
             size = BYTES_PER_MEASUREMENT * len(neighbours) * len(keyframe.log_depth) // (2 if thin else 1)
             if size <= room:

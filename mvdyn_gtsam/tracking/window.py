@@ -122,6 +122,7 @@ class SlidingWindow:
             self._config,
             thin=True,
             robust_px=self._config.window_robust_px,
+            measured=True,
         )
         return keyframe_factor(keyframe.frame, neighbours, fixed, cache(measure))
 
