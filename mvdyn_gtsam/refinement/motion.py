@@ -25,6 +25,7 @@ from mvdyn_gtsam.refinement.moving_depth import (
     link,
     observed_depth,
     region_depth,
+    side_seen,
     smooth_over_time,
 )
 from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
@@ -128,21 +129,11 @@ def settle_task(context: Context, frame: Frame) -> None:
 
 def observe_task(context: Context, frame: Frame) -> list[RegionDepth]:
     """What the other cameras of the instant say of each moving region of a frame."""
-    workspace, wTc = context.workspace, context.poses()
+    workspace = context.workspace
     labels = np.asarray(workspace.read(LABELS, frame))
-    others = [(camera, frame[1]) for camera in context.group_of(frame[0]) if camera != frame[0]]
-    if not others or not labels.any():
+    views = _instant_views(context, frame, MARGIN)
+    if not views or not labels.any():
         return []
-    views = [
-        InstantView(
-            grey=context.luminance(j),
-            intrinsics=workspace.views[j[0]].intrinsics,
-            jTi=invert_pose(wTc[j]) @ wTc[frame],
-            theta=context.image("prior", j),
-            moves=_with_margin(np.asarray(workspace.read(LABELS, j)) > 0),
-        )
-        for j in others
-    ]
     grey, instant = context.luminance(frame), context.image("instant", frame)
     rays = workspace.views[frame[0]].rays
     return [
@@ -151,9 +142,21 @@ def observe_task(context: Context, frame: Frame) -> list[RegionDepth]:
     ]
 
 
-def _with_margin(mask: Mask) -> Mask:
-    """``mask (h, w)`` and its surroundings: an outline is right to some pixels."""
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8)) > 0)
+def _instant_views(context: Context, frame: Frame, margin: int) -> list[InstantView]:
+    """The other cameras of the instant; what moves in them grows by a square of side ``margin`` px, since
+    outlines are right to some pixels only."""
+    workspace, wTc = context.workspace, context.poses()
+    square = np.ones((margin, margin), np.uint8)
+    return [
+        InstantView(
+            grey=context.luminance(j),
+            intrinsics=workspace.views[j[0]].intrinsics,
+            jTi=invert_pose(wTc[j]) @ wTc[frame],
+            theta=context.image("prior", j),
+            moves=cv2.dilate((np.asarray(workspace.read(LABELS, j)) > 0).astype(np.uint8), square) > 0,
+        )
+        for j in ((camera, frame[1]) for camera in context.group_of(frame[0]) if camera != frame[0])
+    ]
 
 
 def depth_of_regions(
@@ -194,11 +197,14 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, float]]) -> 
     labels = np.asarray(workspace.read(LABELS, frame))
     theta, weight = context.image("prior", frame), context.image("prior_weight", frame)
     moving = np.where(labels > 0, UNEXPLAINED, STATIC).astype(np.uint8)
-    instant = context.image("instant", frame)
+    instant, rays = context.image("instant", frame), workspace.views[frame[0]].rays
+    # what other frames' tasks change of these views meanwhile lies where something moves, and is not read
+    views = _instant_views(context, frame, 1) if depths else []
     for label in range(1, int(labels.max()) + 1):
         region = labels == label
         if label in depths:
-            theta[region] = np.log(region_depth(instant, region, depths[label]))
+            matched = np.log(region_depth(instant, region, depths[label]))
+            theta[region] = matched + side_seen(matched, rays[region.ravel()], views)
             moving[region] = MOVING
         else:
             theta[region] = standing(theta, region)

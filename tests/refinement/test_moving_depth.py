@@ -17,6 +17,7 @@ from mvdyn_gtsam.refinement.moving_depth import (
     link,
     observed_depth,
     region_depth,
+    side_seen,
     smooth_over_time,
     support,
 )
@@ -112,6 +113,40 @@ def test_a_depth_that_is_denied_is_no_evidence() -> None:
     grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
     assert observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8)])[1] == 1.0
     assert observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8, ~EVERYWHERE)])[1] == 0.0
+
+
+def from_the_side(degrees: float, radius: float) -> InstantView:
+    """A camera that looks at what is 2 m away, from 2 m, and sees a pillar of that radius move there."""
+    jTi, turn = np.eye(4), np.radians(degrees)
+    jTi[:3, :3] = [[np.cos(turn), 0.0, np.sin(turn)], [0.0, 1.0, 0.0], [-np.sin(turn), 0.0, np.cos(turn)]]
+    jTi[:3, 3] = [0.0, 0.0, 2.0] - jTi[:3, :3] @ [0.0, 0.0, 2.0]
+    moves = np.abs(np.arange(SHAPE[1]) - 39.5) <= 70.0 * radius / 2.0
+    wall = np.full(SHAPE, np.log(0.2), np.float32)
+    return InstantView(textured(), INTRINSICS, jTi, wall, np.broadcast_to(moves, SHAPE))
+
+
+def way_to_the_front(degrees: float, radius: float = 0.3) -> Float32:
+    middle = np.zeros(SHAPE, bool)
+    middle[25:35, 38:42] = True
+    theta = np.full(int(middle.sum()), np.log(0.5), np.float32)
+    return side_seen(theta, RAYS[middle.ravel()], [from_the_side(degrees, radius)])
+
+
+def test_what_is_seen_from_the_side_is_nearer_than_its_middle() -> None:
+    """Seen at a right angle the hull begins one radius before the middle: half of that."""
+    np.testing.assert_allclose(way_to_the_front(90.0), 0.5 * np.log(2.0 / 1.7), atol=0.03)
+    assert way_to_the_front(90.0, 0.5).mean() > way_to_the_front(90.0).mean() + 0.03
+
+
+def test_what_is_seen_from_about_the_same_side_is_where_it_is_matched() -> None:
+    assert (way_to_the_front(10.0) == 0.0).all()
+    assert 0.0 < way_to_the_front(30.0).mean()
+
+
+def test_a_side_that_nobody_sees_moves_nothing() -> None:
+    theta = np.full(1, np.log(0.5), np.float32)
+    assert (side_seen(theta, RAYS[:1], []) == 0.0).all()
+    assert (side_seen(theta, RAYS[:1], [beside(textured(), 400)]) == 0.0).all()
 
 
 def test_regions_that_overlap_are_one_thing() -> None:
