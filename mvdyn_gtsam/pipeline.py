@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,10 +22,11 @@ from mvdyn_gtsam.frontend.threads import in_order
 from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer, WideBaselineInitializer
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction import CaptureInfo, Reconstruction, ReconstructionWriter
-from mvdyn_gtsam.refinement.report import SelfCheck
-from mvdyn_gtsam.refinement.stage import Refinement, Tracked, required
 from mvdyn_gtsam.tracking.model import FrameDepth, TrackingResult
 from mvdyn_gtsam.tracking.tracker import Tracker
+
+if TYPE_CHECKING:
+    from mvdyn_gtsam.refinement.stage import Tracked
 
 logger = logging.getLogger(__name__)
 
@@ -133,6 +135,10 @@ def _refine(
     capture: Capture, flow: DenseFlow, config: Config, writer: ReconstructionWriter, progress: Progress
 ) -> None:
     """Dense depth and poses from flow of every pixel; they replace tracking's when all is done."""
+    # here, so that tracking alone does not wait for what it does not use
+    from mvdyn_gtsam.refinement.report import SelfCheck
+    from mvdyn_gtsam.refinement.stage import Refinement
+
     began = perf_counter()
     tracked = _tracked(capture, writer)
     refinement = Refinement(
@@ -160,6 +166,8 @@ def _refine(
 
 def _announce_refinement(tracked: Tracked, config: Config, writer: ReconstructionWriter) -> None:
     """Say what it takes, and refuse what the disk cannot hold."""
+    from mvdyn_gtsam.refinement.stage import required
+
     disk, seconds = required(tracked, config.refinement)
     free = shutil.disk_usage(writer.folder).free
     logger.info("refinement: %.0f MB of disk while it works, flow takes about %.0f s", disk / 1e6, seconds)
@@ -172,6 +180,8 @@ def _announce_refinement(tracked: Tracked, config: Config, writer: Reconstructio
 
 def _tracked(capture: Capture, writer: ReconstructionWriter) -> Tracked:
     """The tracking result as it lies on disk."""
+    from mvdyn_gtsam.refinement.stage import Tracked
+
     result = Reconstruction.load(writer.tracked())
     names = [camera.name for camera in capture.cameras]
     connections = writer.read_arrays("connections")["frames"]

@@ -86,7 +86,8 @@ def _joint_bilateral(grey: Float32, grid: Grid, table: Float32, contrast: float)
     steepness = np.float32(-1.0 / contrast**2)
     for row, near_row in ((top, 1.0 - below), (np.minimum(top + 1, rows - 1), below)):
         for col, near_col in ((left, 1.0 - right), (np.minimum(left + 1, cols - 1), right)):
-            log_depth, luminance, trust = (table[row[:, None], col, k] for k in range(3))
+            # one axis after the other: half the time of both at once
+            log_depth, luminance, trust = (table[..., k].take(row, 0).take(col, 1) for k in range(3))
             share = np.exp(np.square(grey - luminance) * steepness)
             # Unlike all four: they share the pixel by nearness alone.
             share += np.float32(FLOOR)

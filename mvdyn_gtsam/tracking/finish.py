@@ -26,7 +26,7 @@ from mvdyn_gtsam.tracking.motion import PoseFit, predict_pose
 from mvdyn_gtsam.tracking.polish import estimate_noise, solve_all, total_cost
 from mvdyn_gtsam.tracking.rig import hold_mounts
 from mvdyn_gtsam.tracking.state import TrackState
-from mvdyn_gtsam.tracking.window import solve_depth, useful_neighbours
+from mvdyn_gtsam.tracking.window import MINIMUM_WEIGHT, solve_depth, useful_neighbours
 
 logger = logging.getLogger(__name__)
 
@@ -126,7 +126,10 @@ def _connect_long_range(state: TrackState) -> None:
 
 
 def _remeasure(state: TrackState, on_progress: OnProgress | None) -> None:
-    """Measure new connections, and guided ones anew where depth and poses predict another flow by now."""
+    """Measure new connections, and guided ones anew where depth and poses predict another flow by now.
+
+    Those that found next to nothing stay as they are: of 78 measured anew on two captures 5 found anything.
+    """
     # in time order, so that frames that must be decoded again are read nearly in order
     by_time = [sorted(frames, key=_time_first, reverse=True) for frames in state.kinds]
     ordered = sorted(by_time, key=lambda pair: [_time_first(frame) for frame in pair])
@@ -136,12 +139,19 @@ def _remeasure(state: TrackState, on_progress: OnProgress | None) -> None:
             if on_progress is not None:
                 on_progress(done, len(ordered))
             first, second = state.frames[i], state.frames[j]
-            if j in first.flows and (j not in first.guides or not state.measurer.outdated(first, second)):
+            if j in first.flows and not _due_again(state, first, second):
                 continue
             if state.images.available(i) and state.images.available(j):
                 yield first, second
 
     state.measurer.guided_all(due())
+
+
+def _due_again(state: TrackState, first: Keyframe, second: Keyframe) -> bool:
+    if second.frame not in first.guides:
+        return False
+    found = max(first.flows[second.frame].mean_weight, second.flows[first.frame].mean_weight)
+    return found > MINIMUM_WEIGHT and state.measurer.outdated(first, second)
 
 
 def _make_room(state: TrackState) -> None:
