@@ -82,8 +82,9 @@ class RefinementConfig:
     edges_per_frame: int = 6
     """Edges of a frame that its depth is solved from, those with most parallax. Source: choice, time; 6 to 10
     came out alike on six frames of robodog_overlap, in a trial that is not kept."""
-    depth_iterations: int = 5
-    """Gauss-Newton iterations per depth solve, each with new confidences. Source: choice."""
+    depth_iterations: int = 3
+    """Gauss-Newton iterations per depth solve, each with new confidences. Source: 2 to 5 compared on
+    robodog_overlap, dynamic_human and three_cameras: 3 are better than 5, except where the second moves."""
     pose_iterations: int = 3
     """Gauss-Newton iterations per pose solve. Source: choice."""
     phase1: bool = True

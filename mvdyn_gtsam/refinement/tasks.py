@@ -40,7 +40,7 @@ CHECK_SPACING = 8
 """Distance of the pixels that choose edges and whose residuals are compared, px of the input."""
 FIRST_STEPS = 2
 """Gauss-Newton steps before it is asked what moves."""
-GUIDE_STEPS = 3
+GUIDE_STEPS = 2
 """Gauss-Newton steps of the depth that guides the flow between cameras; that flow improves it later."""
 
 FIRST_DEPTH = "depth 0"
@@ -86,8 +86,9 @@ def begin_task(context: Context, frame: Frame) -> None:
     weights = _image_weights(context, frame)
     chosen = best_candidate([context.image("aligned", frame), context.image("swept", frame)], edges, config)
     weak = DepthPrior(np.log(chosen), np.full(chosen.shape, config.prior_sigma**-2, np.float32))
+    telling = most_telling(edges, chosen, config.edges_per_frame)
     theta, information = solve_frame(
-        np.log(chosen), FrameProblem(edges, {}, weights, weak, config), FIRST_STEPS
+        np.log(chosen), FrameProblem(telling, {}, weights, weak, config), FIRST_STEPS
     )
     workspace.write("first", frame, theta)
     workspace.write("information", frame, information)
@@ -111,8 +112,7 @@ def window_task(context: Context, window: tuple[str, str, int, int, int]) -> Non
             moves = workspace.read("moving", frame) != STATIC
             sparse = context.edges(frame, wTc, own_camera=False, among=context.raster(frame, CHECK_SPACING))
             telling = most_telling(sparse, context.image(source, frame), config.edges_per_frame)
-            edges = load_edges(workspace, frame, [edge.j for edge in telling], wTc)
-            edges = [edge if edge.same_instant else edge.without(moves.ravel()) for edge in edges]
+            edges = _edges_of(context, frame, [edge.j for edge in telling], moves, wTc)
             others = {
                 edge.j: renewed[edge.j] if edge.j in renewed else np.log(context.image(source, edge.j))
                 for edge in edges
@@ -126,6 +126,18 @@ def window_task(context: Context, window: tuple[str, str, int, int, int]) -> Non
             if first <= frame[1] < end:
                 workspace.write(target, frame, np.exp(theta))
                 workspace.write("information", frame, information)
+
+
+def _edges_of(
+    context: Context, frame: Frame, neighbours: Sequence[Frame], moves: Mask, wTc: Array
+) -> list[Edge]:
+    """Edges of a frame to some neighbours, to other instants without the pixels ``(h, w)`` that move."""
+    still = np.flatnonzero(~moves) if moves.any() else None
+    return [
+        edge
+        for j in neighbours
+        for edge in load_edges(context.workspace, frame, [j], wTc, None if j[1] == frame[1] else still)
+    ]
 
 
 def planes_task(context: Context, job: tuple[str, Frame]) -> Array:
