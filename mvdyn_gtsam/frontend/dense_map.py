@@ -87,9 +87,9 @@ def testimony_flow(config: FlowConfig) -> FlowConfig:
 
     On a wall of repeated posters (multicamvideo) the truth leads a shifted placement by 3.2 to 1.5 with four
     neighbours. It was 2.8 to 2.3 with three, and 3.4 to 2.6 with three and flow of full resolution, which
-    takes three times as long; with two the shifted one led. Two iterations of the smoothing take 70 % of the
-    time of five: the truth kept its lead there (12.3 to 4.7 in favour, 1.7 to 4.4 against with five; 11.7 to 4.6
-    and 1.3 to 4.1 with two) and on three_cameras.
+    takes three times as long; with two the shifted one led. Two iterations of smoothing take 70 % of the time
+    of five, and the truth kept its lead: 11.7 for and 1.3 against it, 4.6 and 4.1 for the shifted one, where
+    five gave 12.3 and 1.7, 4.7 and 4.4.
     """
     return replace(config, finest_scale=min(config.finest_scale, 1), variational_iterations=2)
 

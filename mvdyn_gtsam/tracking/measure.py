@@ -130,9 +130,11 @@ class EdgeMeasurer:
             run = partial(_guide_dense, self._flow, *images, *views, jTi, self._flow_config)
         return _Job(i, j, guides, run)
 
-    def outdated(self, i: Keyframe, j: Keyframe) -> bool:
-        """Whether depth and poses now predict another flow than the one it was guided by."""
-        return max(self._change(i, j), self._change(j, i)) > self._config.remeasure_px
+    def outdated(self, i: Keyframe, j: Keyframe, limit_px: float | None = None) -> bool:
+        """Whether depth and poses now predict another flow than the one it was guided by, by more than
+        ``limit_px`` (default: ``remeasure_px``) in the median."""
+        limit = self._config.remeasure_px if limit_px is None else limit_px
+        return max(self._change(i, j), self._change(j, i)) > limit
 
     def _change(self, i: Keyframe, j: Keyframe) -> float:
         guide = i.guides[j.frame]
