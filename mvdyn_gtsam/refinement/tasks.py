@@ -86,9 +86,9 @@ def begin_task(context: Context, frame: Frame) -> None:
     weights = _image_weights(context, frame)
     chosen = best_candidate([context.image("aligned", frame), context.image("swept", frame)], edges, config)
     weak = DepthPrior(np.log(chosen), np.full(chosen.shape, config.prior_sigma**-2, np.float32))
-    telling = most_telling(edges, chosen, config.edges_per_frame)
+    # of all edges: how far they settle the depth decides what moves
     theta, information = solve_frame(
-        np.log(chosen), FrameProblem(telling, {}, weights, weak, config), FIRST_STEPS
+        np.log(chosen), FrameProblem(edges, {}, weights, weak, config), FIRST_STEPS
     )
     workspace.write("first", frame, theta)
     workspace.write("information", frame, information)
