@@ -1,10 +1,15 @@
-"""Time per frame by phase, peak memory and ATE against the video's length and the number of cameras.
+"""Time per image by phase, peak memory and ATE against length, number of cameras, and pixels.
 
 The study `frames` plays a short capture forwards and backwards to each length (images are written once and
 linked; its true poses follow), cut to --of cameras. The study `cameras` generates a scene for each number of
-cameras, every one the same but for that number. Each size runs `mvdyn reconstruct` in a process of its own,
-whose peak resident memory is set against that of a process that imports the same libraries and does nothing.
+cameras, every one the same but for that number; the study `pixels` one for each width, in the ratio 4:3. Each
+size runs `mvdyn reconstruct` in a process of its own, whose peak resident memory is set against that of a
+process that imports the same libraries and does nothing.
 Goal: at most 1.5 GB above the libraries, growing no more than the result; time per frame flat.
+
+With --stage refinement, tracking and refinement run one after the other in processes of their own, so that
+each has its own peak, and the pages (scaling_STUDY_refinement.md) show the refinement apart: its seconds in
+flow and in all the rest (goal: all of it at most twice the flow), its memory (goal: 2 GB).
 
 Sizes are kept one by one, so a long study can be run in parts: give some sizes now, and all of them at the
 end for the whole page.
@@ -24,7 +29,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.plots import Entries, lines, scores_value
 from experiments.records import (
     QUICK_FRAMES,
     RENDERED,
@@ -33,30 +37,30 @@ from experiments.records import (
     Run,
     captures_or_rendered,
     experiment_parser,
-    figure,
     finite,
     key_of,
     parse,
     quick_scene,
     run_experiment,
     settings_arguments,
-    table,
 )
+from experiments.scaling_pages import draw, render
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import load_config, to_dict
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from mvdyn_gtsam.baselines.process import ProcessUsage
     from mvdyn_gtsam.reconstruction import Reconstruction
 
 NAME = "scaling"
-GOAL_MB = 1500.0
-PHASES = ("start", "tracking", "refinement")
 STUDIES = {
     "frames": "Time, memory and error against length",
     "cameras": "Time, memory and error against the number of cameras",
+    "pixels": "Time, memory and error against the size of the images",
 }
+STAGES = ("tracking", "refinement")
+MIN_WIDTH = 64
+"""px; below that there is nothing to match."""
 
 LIBRARIES = (
     "import mvdyn_gtsam.cli.main, mvdyn_gtsam.cli.reconstruct, mvdyn_gtsam.cli.progress, mvdyn_gtsam.pipeline"
@@ -113,15 +117,6 @@ def _write_long_truth(capture: Capture, source: Path, order: Sequence[int], out:
             (out / f"{camera}.txt").write_text(tum_lines(np.array(known) / capture.fps, wTc))
 
 
-def generate(cameras: int, frames: int, folder: Path) -> Path:
-    """The generated scene of that size below ``folder``, made where it is not there yet."""
-    from mvdyn_gtsam.scenes import SceneSettings, make_scene
-
-    # Depth, masks and flow of the first frame alone: poses are what is scored.
-    settings = SceneSettings(cameras=cameras, frames=frames, every=frames)
-    return make_scene(settings, folder / f"generated_{cameras}x{frames}")
-
-
 @dataclass(frozen=True)
 class Size:
     """One size of one study, and how its capture comes about."""
@@ -131,20 +126,49 @@ class Size:
     frames: int
     source: Path | None
     """Capture to play; None: generate the scene."""
-    scene_of_quick: bool = False
+    width: int | None = None
+    """Of the generated scene, px; None: what that has by itself."""
 
     @property
     def name(self) -> str:
         return "generated" if self.source is None else self.source.resolve().name
 
+    @property
+    def label(self) -> str:
+        wide = "" if self.width is None else f", {self.width} px wide"
+        return f"{self.name}, {self.cameras} cameras, {self.frames} frames{wide}"
+
+    def folder(self, stage: str) -> str:
+        """Name of the folder it works in, another for each stage."""
+        parts = [self.study, f"{self.cameras}x{self.frames}"]
+        parts += [] if self.width is None else [f"{self.width}px"]
+        return "_".join(parts if stage == STAGES[0] else [*parts, stage])
+
     def prepare(self, options: argparse.Namespace, folder: Path) -> Path:
         """The capture of this size, in the new folder ``folder`` or kept in ``--work``."""
-        if self.source is not None:
-            write_long_capture(self.source, self.cameras, self.frames, folder)
-            return folder
-        if self.scene_of_quick:
-            return quick_scene(options.results, self.cameras, self.frames)
-        return generate(self.cameras, self.frames, options.work / "scenes")
+        if self.source is None:
+            return generate(self, options)
+        write_long_capture(self.source, self.cameras, self.frames, folder)
+        return folder
+
+
+def generate(size: Size, options: argparse.Namespace) -> Path:
+    """The generated scene of that size, or that of ``--quick``, made where it is not there yet."""
+    from mvdyn_gtsam.scenes import SceneSettings, make_scene
+
+    if options.quick:
+        from experiments.quick import quick_settings
+
+        settings, folder = quick_settings(size.cameras, size.frames), options.results / "scenes" / "quick"
+    else:
+        # Depth, masks and flow of the first frame alone: poses are what is scored.
+        settings = SceneSettings(cameras=size.cameras, frames=size.frames, every=size.frames)
+        folder = options.work / "scenes" / "generated"
+    name = f"{folder.name}_{size.cameras}x{size.frames}"
+    if size.width is not None and size.width != settings.width:
+        settings = replace(settings, width=size.width, height=3 * size.width // 4)
+        name += f"_{size.width}px"
+    return make_scene(settings, folder.with_name(name))
 
 
 def measure_libraries() -> float:
@@ -160,33 +184,61 @@ def measure_libraries() -> float:
 
 def measure(size: Size, options: argparse.Namespace) -> dict[str, Any]:
     """Reconstruct a capture of that size and say what it took; a run that fails is an entry that says so."""
-    from mvdyn_gtsam.baselines.comparison import our_command
-    from mvdyn_gtsam.baselines.process import run_measured
+    from mvdyn_gtsam.capture import load_capture
     from mvdyn_gtsam.reconstruction import Reconstruction
 
     # Kept until the next run: what a failed one left can be looked at.
-    folder = options.work / f"{size.study}_{size.cameras}x{size.frames}"
+    folder = options.work / size.folder(options.stage)
     shutil.rmtree(folder, ignore_errors=True)
     capture = size.prepare(options, folder / "capture")
     result = folder / "result"
-    command = our_command(capture, result, options.stage, settings_arguments(options.overrides))
-    usage = run_measured(command, folder / "log")
+    usages = run_stages(capture, result, options)
+    camera = load_capture(capture).cameras[0]
     entry = {
         "study": size.study,
         "capture": size.name,
         "cameras": size.cameras,
         "frames": size.frames,
+        "width": camera.width,
+        "height": camera.height,
         "stage": options.stage,
-        "problem": usage.problem,
-        "seconds": usage.seconds,
-        "cpu_seconds": finite(usage.cpu_seconds),
-        "peak_mb": finite(usage.peak_mb),
+        **totals(usages),
         "libraries_mb": measure_libraries(),
     }
-    if usage.problem is None:
+    if entry["problem"] is None:
         entry |= {"result_mb": folder_mb(result), **_what_it_says(Reconstruction.load(result), capture)}
+        if options.stage == "refinement":
+            entry |= _what_refinement_says(Reconstruction.load(result), options.overrides)
         shutil.rmtree(folder)
     return entry
+
+
+def run_stages(capture: Path, result: Path, options: argparse.Namespace) -> dict[str, ProcessUsage]:
+    """Usage of each stage up to ``--stage``, each a process of its own; none after one that failed."""
+    from mvdyn_gtsam.baselines.comparison import our_command
+    from mvdyn_gtsam.baselines.process import run_measured
+
+    settings = settings_arguments(options.overrides)
+    command = our_command(capture, result, "tracking", settings)
+    usages = {"tracking": run_measured(command, result.with_name("log"))}
+    if options.stage == "refinement" and usages["tracking"].problem is None:
+        command = [sys.executable, "-m", "mvdyn_gtsam.cli.main", "reconstruct", str(capture)]
+        command += ["--out", str(result), "--stage", "refinement", "--resume", *settings]
+        usages["refinement"] = run_measured(command, result.with_name("refinement.log"))
+    return usages
+
+
+def totals(usages: Mapping[str, ProcessUsage]) -> dict[str, Any]:
+    """Seconds of all stages, the largest process of any, and the peak of each."""
+    peaks = {stage: finite(usage.peak_mb) for stage, usage in usages.items()}
+    cpu = [usage.cpu_seconds for usage in usages.values()]
+    return {
+        "problem": next((usage.problem for usage in usages.values() if usage.problem is not None), None),
+        "seconds": sum(usage.seconds for usage in usages.values()),
+        "cpu_seconds": None if None in cpu else finite(sum(value for value in cpu if value is not None)),
+        "peak_mb": max((peak for peak in peaks.values() if peak is not None), default=None),
+        "stage_peak_mb": peaks,
+    }
 
 
 def _what_it_says(result: Reconstruction, capture: Path) -> dict[str, Any]:
@@ -201,111 +253,23 @@ def _what_it_says(result: Reconstruction, capture: Path) -> dict[str, Any]:
     }
 
 
+def _what_refinement_says(result: Reconstruction, overrides: Sequence[str]) -> dict[str, Any]:
+    """Seconds by step, and how many processes held memory at once."""
+    from mvdyn_gtsam.refinement.pool import worker_count
+
+    # Counted here: a child may run on the same processors.
+    workers = worker_count(load_config(None, overrides).refinement.workers)
+    # A single worker is the main process itself.
+    processes = 1 if workers == 1 else workers + 1
+    return {
+        "refinement_seconds": result.diagnostics("refinement_seconds"),
+        "refinement_processes": processes,
+    }
+
+
 def folder_mb(folder: Path) -> float:
     """Size in MiB of all files below ``folder``."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 2**20
-
-
-def images(entry: Mapping[str, Any]) -> int:
-    """Frames of all cameras."""
-    return int(entry["cameras"]) * int(entry["frames"])
-
-
-COLUMNS = (
-    *("cameras x frames", "registered %", "ATE mm", "s", "s per image"),
-    *PHASES,
-    *("s per added image", "peak MB", "above libraries MB", "growth MB", "result MB", "growth MB"),
-)
-
-
-def rows(entries: Entries) -> list[list[str]]:
-    """One row per size; growth is against the last size above that was finished."""
-    result: list[list[str]] = []
-    before: Mapping[str, Any] | None = None
-    for entry in entries:
-        size = f"{entry['cameras']} x {entry['frames']}"
-        if entry["problem"] is not None:
-            result.append([f"{size} (failed)", *["-"] * (len(COLUMNS) - 1)])
-            continue
-        added = _added(before, entry, "seconds")
-        more = None if before is None else images(entry) - images(before)
-        scores = entry["scores"] or {}
-        result.append(
-            [
-                size,
-                figure(scores.get("registered"), 1, 100.0),
-                figure(scores.get("ate_m"), 1, 1e3),
-                figure(entry["seconds"], 0),
-                figure(entry["seconds"] / images(entry), 3),
-                *(figure(per_image(phase, entry), 3) for phase in PHASES),
-                figure(None if added is None or not more else added / more, 3),
-                figure(entry["peak_mb"], 0),
-                figure(entry["peak_mb"] - entry["libraries_mb"], 0),
-                figure(_added(before, entry, "peak_mb"), 0),
-                figure(entry["result_mb"], 0),
-                figure(_added(before, entry, "result_mb"), 0),
-            ]
-        )
-        before = entry
-    return result
-
-
-def _added(before: Mapping[str, Any] | None, entry: Mapping[str, Any], key: str) -> float | None:
-    return None if before is None else float(entry[key]) - float(before[key])
-
-
-def per_image(phase: str, entry: Mapping[str, Any]) -> float | None:
-    """Seconds per image of one phase, None where it did not run."""
-    seconds = entry["phase_seconds"].get(phase)
-    return None if seconds is None else float(seconds) / images(entry)
-
-
-def render(study: str, entries: Entries) -> str:
-    """Table, goal and failures of one study as Markdown."""
-    names = ", ".join(dict.fromkeys(entry["capture"] for entry in entries))
-    what = (
-        f"{names} played forwards and backwards" if study == "frames" else f"{names}: the scene of each row"
-    )
-    return (
-        f"{what}; interpreter and libraries alone take {figure(entries[-1]['libraries_mb'], 0)} MB. Goal:"
-        f" at most {GOAL_MB:.0f} MB above them, growing no more than the result. Phases in seconds per image,"
-        " MB are MiB; commit "
-        f"{', '.join(sorted({str(entry['commit']) for entry in entries}))}.\n\n"
-        + table(COLUMNS, rows(entries))
-        + _notes(entries)
-    )
-
-
-def _notes(entries: Entries) -> str:
-    """Failures and cameras left apart, below the table."""
-    lines = []
-    for entry in entries:
-        size = f"* {entry['cameras']} x {entry['frames']}"
-        groups = ((entry.get("scores") or {}).get("groups")) or []
-        if entry["problem"] is not None:
-            lines.append(f"{size}: {entry['problem']}")
-        elif len(groups) > 1:
-            names = " / ".join("+".join(group["cameras"]) for group in groups)
-            lines.append(f"{size}: the start leaves cameras apart ({names}); ATE over all means little")
-    return "".join(f"\n{line}" for line in lines) + ("\n" if lines else "")
-
-
-def draw(study: str, picture: Figure, entries: Entries) -> None:
-    """Seconds per image by phase, memory, and ATE over the size."""
-    done = [entry for entry in entries if entry["problem"] is None]
-    seconds, memory, error = picture.subplots(1, 3)
-
-    def over(entry: Mapping[str, Any]) -> float:
-        return float(entry[study])
-
-    phases = {phase: partial(per_image, phase) for phase in PHASES}
-    lines(seconds, done, over, phases, study, "seconds per image")
-    megabytes = {
-        "peak, above the libraries": lambda entry: entry["peak_mb"] - entry["libraries_mb"],
-        "result on disk": lambda entry: entry["result_mb"],
-    }
-    lines(memory, done, over, megabytes, study, "MB")
-    lines(error, done, over, {"ATE": scores_value("ate_m", 1e3)}, study, "ATE (mm)")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -317,12 +281,14 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument("--frames", nargs="+", type=int, metavar="N",
                         help="lengths per camera (default: 100 200 400 700 1000)")  # fmt: skip
     result.add_argument("--of", type=int, default=2, metavar="CAMERAS",
-                        help="cameras of the study `frames` (default: %(default)s)")  # fmt: skip
+                        help="cameras of `frames` and `pixels` (default: %(default)s)")  # fmt: skip
     result.add_argument("--cameras", nargs="+", type=int, metavar="N",
                         help="numbers of cameras (default: 2 3 4 6 8)")  # fmt: skip
+    result.add_argument("--widths", nargs="+", type=int, metavar="N",
+                        help="px, heights are three quarters of them (default: 256 384 512 768)")  # fmt: skip
     result.add_argument("--generated-frames", type=int, metavar="N",
-                        help="length of the study `cameras` (default: 60)")  # fmt: skip
-    result.add_argument("--stage", choices=("tracking", "refinement"), default="tracking",
+                        help="length of the studies `cameras` and `pixels` (default: 60)")  # fmt: skip
+    result.add_argument("--stage", choices=STAGES, default=STAGES[0],
                         help="last stage to run (default: %(default)s)")  # fmt: skip
     return result
 
@@ -339,8 +305,11 @@ def sizes(options: argparse.Namespace, study: str) -> list[Size]:
         wanted = options.frames or ([10, 20] if quick else [100, 200, 400, 700, 1000])
         return [Size(study, options.of, length, source) for length in sorted(set(wanted))]
     frames = options.generated_frames or (QUICK_FRAMES if quick else 60)
-    wanted = options.cameras or ([2, 3] if quick else [2, 3, 4, 6, 8])
-    return [Size(study, cameras, frames, None, quick) for cameras in sorted(set(wanted))]
+    if study == "cameras":
+        wanted = options.cameras or ([2, 3] if quick else [2, 3, 4, 6, 8])
+        return [Size(study, cameras, frames, None) for cameras in sorted(set(wanted))]
+    wanted = options.widths or ([192, 256] if quick else [256, 384, 512, 768])
+    return [Size(study, options.of, frames, None, width) for width in sorted(set(wanted))]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -354,6 +323,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command_line.error("--frames and --generated-frames must be at least 2")
     if min([*(options.cameras or [1]), options.of]) < 1:
         command_line.error("--cameras and --of must be at least 1")
+    if any(width < MIN_WIDTH or width % 4 for width in options.widths or []):
+        command_line.error(f"--widths must be multiples of 4, for whole heights, from {MIN_WIDTH} px on")
     # In that order, whatever was said: only the first can lack its capture, which hours later is too late.
     for study in STUDIES:
         if study in options.studies and (code := _run_study(study, options, words)):
@@ -366,10 +337,11 @@ def _run_study(study: str, options: argparse.Namespace, words: Sequence[str]) ->
         settings = to_dict(load_config(None, options.overrides))
         return [
             Run(
-                label=f"{size.name}, {size.cameras} cameras, {size.frames} frames",
+                label=size.label,
                 key=key_of(
                     **{"study": study, "capture": size.name, "cameras": size.cameras},
                     **{"frames": size.frames, "stage": options.stage, "settings": settings},
+                    **({} if size.width is None else {"width": size.width}),
                 ),
                 measure=partial(measure, size, options),
                 again=options.again,
@@ -377,9 +349,12 @@ def _run_study(study: str, options: argparse.Namespace, words: Sequence[str]) ->
             for size in sizes(options, study)
         ]
 
-    path = options.results / f"{NAME}_{study}.md"
-    pages = [Page(path, STUDIES[study], partial(render, study), partial(draw, study))]
-    return run_experiment(NAME, words, options.results / f"{NAME}.json", pages, plan)
+    # Of a stage each: a run with the refinement must not take the place of one without.
+    refined = options.stage == "refinement"
+    path = options.results / f"{NAME}_{study}{'_refinement' if refined else ''}.md"
+    title = STUDIES[study] + (", with the refinement" if refined else "")
+    page = Page(path, title, partial(render, study, options.stage), partial(draw, study, options.stage))
+    return run_experiment(NAME, words, options.results / f"{NAME}.json", [page], plan)
 
 
 if __name__ == "__main__":

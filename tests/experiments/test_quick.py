@@ -63,14 +63,29 @@ def test_refinement_phases_pictures_of_what_they_leave_and_the_summary(results: 
 
 
 def test_scaling(results: Path) -> None:
-    words = ["--quick", "--results", str(results), "--frames", "10", "--cameras", "2"]
-    assert scaling.main(words) == 0
+    words = ["--quick", "--results", str(results), "--studies", "frames", "cameras", "--frames", "10"]
+    assert scaling.main([*words, "--cameras", "2"]) == 0
     for entry in runs(results, "scaling"):
         assert entry["problem"] is None and entry["scores"]["registered"] == 1.0
         assert entry["peak_mb"] > entry["libraries_mb"] > 0.0
         assert set(entry["phase_seconds"]) == {"start", "tracking"}
     is_whole(results, "scaling_frames")
     is_whole(results, "scaling_cameras")
+
+
+def test_scaling_of_the_refinement_with_pixels(results: Path) -> None:
+    words = ["--quick", "--results", str(results), "--stage", "refinement", "--studies", "pixels"]
+    assert scaling.main([*words, "--widths", "192", "256", "--generated-frames", "10"]) == 0
+    made = [entry for entry in runs(results, "scaling") if entry["study"] == "pixels"]
+    assert [(entry["width"], entry["height"]) for entry in made] == [(192, 144), (256, 192)]
+    for entry in made:
+        assert entry["problem"] is None and entry["scores"]["registered"] == 1.0
+        assert set(entry["phase_seconds"]) == {"start", "tracking", "refinement"}
+        steps = entry["refinement_seconds"]
+        assert steps["temporal flow"] > 0.0 and steps["wide flow"] > 0.0
+        assert sum(steps.values()) <= entry["phase_seconds"]["refinement"] < entry["seconds"]
+        assert entry["stage_peak_mb"]["refinement"] > entry["libraries_mb"] / 2
+    is_whole(results, "scaling_pixels_refinement")
 
 
 def test_wide_baseline(results: Path) -> None:
