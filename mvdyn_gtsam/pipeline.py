@@ -145,14 +145,15 @@ def _refine(
         tracked, writer.refinement_folder / "work", config.refinement, flow, config.frontend.flow, progress
     )
     _announce_refinement(tracked, config, writer)
-    refined = refinement.run()
     names = [camera.name for camera in capture.cameras]
     residuals = SelfCheck(names)
-    for frame in refinement.frames():
-        camera, time = frame.frame
-        residuals.add(frame)
-        writer.write_motion(names[camera], time, frame.moving)
-        writer.write_depth(names[camera], time, frame.depth, frame.confidence, refined=True)
+    with refinement:
+        refined = refinement.run()
+        for frame in refinement.frames():
+            camera, time = frame.frame
+            residuals.add(frame)
+            writer.write_motion(names[camera], time, frame.moving)
+            writer.write_depth(names[camera], time, frame.depth, frame.confidence, refined=True)
     for camera, name in enumerate(names):
         writer.write_trajectory(name, capture.timestamps, refined.wTc[camera], refined=True)
     writer.publish_refined()

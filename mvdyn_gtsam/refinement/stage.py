@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
+from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
@@ -90,7 +91,8 @@ def required(tracked: Tracked, config: RefinementConfig) -> tuple[float, float]:
 
 
 class Refinement:
-    """One refinement; ``run`` does it, ``frames`` hands out its frames, ``remove`` cleans up."""
+    """One refinement, to be entered: its processes live as long. ``run`` does it, ``frames`` hands out its
+    frames, ``remove`` cleans up."""
 
     def __init__(
         self,
@@ -114,8 +116,18 @@ class Refinement:
         self._frames = [
             (camera, time) for time in range(self._frame_count) for camera in range(len(tracked.cameras))
         ]
+        self._pool = TaskPool(self._context, config.workers)
         self._depth = "aligned"
         self.seconds: dict[str, float] = {}
+
+    def __enter__(self) -> Refinement:
+        self._pool.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.__exit__(kind, error, trace)
 
     def run(self) -> Refined:
         """Everything but handing out the frames; what an earlier run finished is not done again."""
@@ -123,35 +135,32 @@ class Refinement:
         # the number of processes decides nothing
         self._workspace.prepare(repr((replace(config, workers=0), self._context.flow_config)))
         self._step("images", self._store_images)
-        with TaskPool(self._context, config.workers) as pool:
-            self._pool = pool
-            self._step("sweep", lambda: self._map("sweep", self._frames))
-            self._step("temporal flow", lambda: self._map("temporal flow", self._within))
-            if config.phase1:
-                self._step("phase 1", self._align)
-            if config.phase2:
-                self._step("begin", lambda: self._map("begin", self._frames))
-                self._step("free space", lambda: self._map("free space", self._frames))
-                self._step("settle", self._settle)
-                self._depth = "begun"
-                self._solve_depth(FIRST_DEPTH, min(GUIDE_STEPS, config.depth_iterations))
-                self._step("wide flow", lambda: self._map("wide flow", self._across))
-                for number in range(1, config.rounds + 1):
-                    self._step(f"poses {number}", self._solve_poses)
-                    self._solve_depth(f"depth {number}", config.depth_iterations)
-                if config.plain.fill:
-                    self._fill_plain("filled")
+        self._step("sweep", lambda: self._map("sweep", self._frames))
+        self._step("temporal flow", lambda: self._map("temporal flow", self._within))
+        if config.phase1:
+            self._step("phase 1", self._align)
+        if config.phase2:
+            self._step("begin", lambda: self._map("begin", self._frames))
+            self._step("free space", lambda: self._map("free space", self._frames))
+            self._step("settle", self._settle)
+            self._depth = "begun"
+            self._solve_depth(FIRST_DEPTH, min(GUIDE_STEPS, config.depth_iterations))
+            self._step("wide flow", lambda: self._map("wide flow", self._across))
+            for number in range(1, config.rounds + 1):
+                self._step(f"poses {number}", self._solve_poses)
+                self._solve_depth(f"depth {number}", config.depth_iterations)
+            if config.plain.fill:
+                self._fill_plain("filled")
         scales = self._workspace.read_array("scales")
         return Refined(self._context.poses(), scales[0], scales[1], self.seconds)
 
     def frames(self) -> Iterator[FinishedFrame]:
         """Every frame at the input resolution, in time order."""
         jobs = [(self._depth, frame) for frame in self._frames]
-        with TaskPool(self._context, self._config.workers) as pool:
-            for done, frame in enumerate(pool.map("finish", jobs)):
-                assert isinstance(frame, FinishedFrame)
-                yield frame
-                self._progress.update("refined depth", done + 1, len(jobs))
+        for done, frame in enumerate(self._pool.map("finish", jobs)):
+            assert isinstance(frame, FinishedFrame)
+            yield frame
+            self._progress.update("refined depth", done + 1, len(jobs))
 
     def remove(self) -> None:
         """Remove the workspace."""
