@@ -45,6 +45,8 @@ OTHER_PAGES = {
     "ablation_edge_shares": "edge shares over time (the paper has a figure without numbers)",
     "scaling_frames": "time, memory and error against length",
     "scaling_cameras": "time, memory and error against the number of cameras",
+    "scaling_frames_refinement": "time and memory of the refinement against length",
+    "scaling_pixels_refinement": "time and memory of the refinement against the size of the images",
     "wide_baseline": "the wide-baseline start alone",
 }
 """Pages without a table of the paper to stand beside."""

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.refinement.initial import closed
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import pixels_seen
 
@@ -68,7 +69,7 @@ def grown(mask: Mask, config: RefinementConfig) -> Mask:
 
 def outlined(mask: Mask, around: Mask, grey: Float32, behind: Float32, config: RefinementConfig) -> Mask:
     """Pixels of ``around (h, w)`` that differ from what stands ``behind (h, w)`` them; where that is NaN,
-    those of ``mask (h, w)``."""
+    those of ``mask (h, w)``. Of ``mask`` also the gaps between these, which only look like the background."""
     known = np.isfinite(behind) & around
     difference = np.where(known, np.abs(grey - behind), 0.0).astype(np.float32)
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.0)
@@ -76,7 +77,8 @@ def outlined(mask: Mask, around: Mask, grey: Float32, behind: Float32, config: R
     moves = np.where(known, difference > config.moving_contrast, mask & around).astype(np.uint8)
     moves = cv2.medianBlur(moves, 5)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
-    return np.asarray((cv2.morphologyEx(moves, cv2.MORPH_CLOSE, kernel) > 0) & around)
+    moves = np.asarray(cv2.morphologyEx(moves, cv2.MORPH_CLOSE, kernel), np.uint8)
+    return np.asarray(((moves > 0) | (closed(moves, config) > 0) & mask) & around)
 
 
 def _sampled(image: Float32, at: Float32, outside: float) -> Float32:

@@ -74,3 +74,17 @@ def test_grown_reaches_as_far_as_the_setting() -> None:
     mask = np.zeros((41, 100), bool)
     mask[20, 50] = True
     assert np.count_nonzero(grown(mask, CONFIG)) == (2 * 6 + 1) ** 2
+
+
+def test_a_gap_that_looks_like_the_background_is_closed_where_it_moves() -> None:
+    shape = (80, 256)
+    thing = np.zeros(shape, bool)
+    thing[20:60, 100:160] = True
+    wall = np.full(shape, 100.0, np.float32)
+    grey = np.where(thing, 40.0, wall).astype(np.float32)
+    grey[30:50, 124:136] = 100.0
+    around = grown(thing, CONFIG)
+    assert outlined(thing, around, grey, wall, CONFIG)[32:48, 126:134].all()
+    beside = thing.copy()
+    beside[25:55, 119:141] = False
+    assert not outlined(beside, around, grey, wall, CONFIG)[34:46, 128:132].any()
