@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,9 @@ from mvdyn_gtsam.errors import ResultError
 from mvdyn_gtsam.graph.connections import Frame
 
 Array = npt.NDArray[np.float64]
+
+ITEM_BYTES = 8
+"""Of a number on disk, integer or not."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +47,17 @@ class SampleStore:
 
     def write(self, samples: Iterable[FrameSample]) -> None:
         """Replace what the file holds. Raises ResultError when the disk is full."""
-        with self._path.open("wb") as file:
+        # unbuffered: a full disk is met here, not when the file is closed
+        with self._path.open("wb", buffering=0) as file:
             for sample in samples:
-                frames = np.array([sample.i, *sample.neighbours])
+                frames = np.array([sample.i, *sample.neighbours], np.int64)
+                sizes = np.array([len(sample.neighbours), len(sample.rays)], np.int64)
+                arrays = [np.ascontiguousarray(getattr(sample, name), np.float64) for name in _shapes(0, 0)]
+                # one piece without headers: to parse them took longer than to compute with what they head
+                left = memoryview(b"".join(array.tobytes() for array in (sizes, frames, *arrays)))
                 try:
-                    for array in (frames, *(getattr(sample, name) for name in _ARRAYS)):
-                        np.save(file, array, allow_pickle=False)
-                    file.flush()
+                    while left:
+                        left = left[file.write(left) :]
                 except OSError as error:
                     raise ResultError(
                         f"{self._path}: cannot be written ({error.strerror}); free space, then continue with"
@@ -59,10 +67,24 @@ class SampleStore:
     def read(self) -> Iterator[FrameSample]:
         """The samples in the order written, one in memory at a time."""
         with self._path.open("rb") as file:
-            while file.peek(1):
-                i, *neighbours = [(int(camera), int(time)) for camera, time in np.load(file)]
-                arrays = {name: np.load(file) for name in _ARRAYS}
-                yield FrameSample(i=i, neighbours=tuple(neighbours), **arrays)
+            while head := file.read(2 * ITEM_BYTES):
+                neighbours, pixels = (int(size) for size in np.frombuffer(head, np.int64))
+                frames = np.frombuffer(file.read(2 * (neighbours + 1) * ITEM_BYTES), np.int64)
+                i, *others = [(int(camera), int(time)) for camera, time in frames.reshape(-1, 2)]
+                arrays = {
+                    name: np.frombuffer(file.read(prod(shape) * ITEM_BYTES)).reshape(shape)
+                    for name, shape in _shapes(neighbours, pixels).items()
+                }
+                yield FrameSample(i=i, neighbours=tuple(others), **arrays)
 
 
-_ARRAYS = ("rays", "inverse_depth", "intrinsics", "target", "weight", "inverse_depth_there")
+def _shapes(neighbours: int, pixels: int) -> dict[str, tuple[int, ...]]:
+    """Of a sample's arrays, in the order in which they are written."""
+    return {
+        "rays": (pixels, 3),
+        "inverse_depth": (pixels,),
+        "intrinsics": (neighbours, 3, 3),
+        "target": (neighbours, pixels, 2),
+        "weight": (neighbours, pixels),
+        "inverse_depth_there": (neighbours, pixels),
+    }

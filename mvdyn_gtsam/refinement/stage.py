@@ -220,7 +220,7 @@ class Refinement:
 
     def _sample(self) -> Callable[[], Iterable[FrameSample]]:
         """Sample every frame once; what is returned reads them back, as often as a solve asks."""
-        store = SampleStore(self._workspace.folder / "samples.npy")
+        store = SampleStore(self._workspace.folder / "samples.bin")
         jobs = [(self._depth, frame) for frame in self._frames]
         store.write(sample for sample in self._pool.map("sample", jobs) if isinstance(sample, FrameSample))
         return store.read
