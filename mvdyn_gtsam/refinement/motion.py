@@ -8,6 +8,8 @@ writes it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +19,7 @@ from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
-from mvdyn_gtsam.refinement.free_space import DepthView, seen_through, without_outlines
+from mvdyn_gtsam.refinement.free_space import BEHIND, DepthView, seen_through, without_outlines
 from mvdyn_gtsam.refinement.initial import closed, moving_regions, regions, static_residual
 from mvdyn_gtsam.refinement.moving_depth import (
     InstantView,
@@ -58,6 +60,15 @@ MARGIN = 9
 Source: choice, what their outlines err by."""
 LABELS = "labels"
 """The array of moving regions, numbered from 1 in every frame."""
+
+
+@dataclass(frozen=True)
+class KnownDepth:
+    """Of a moving region of a frame."""
+
+    log_inverse_depth: float
+    believed: bool
+    """Whether the images of this instant or those near support that it moves there."""
 
 
 def free_space_task(context: Context, frame: Frame) -> None:
@@ -161,8 +172,8 @@ def _instant_views(context: Context, frame: Frame, margin: int) -> list[InstantV
 
 def depth_of_regions(
     context: Context, frames: list[Frame], found: list[list[RegionDepth]]
-) -> list[dict[int, float]]:
-    """Log inverse depth by label of the moving regions of each of ``frames``, those that can be believed.
+) -> list[dict[int, KnownDepth]]:
+    """Depth by label of the moving regions of each of ``frames``, as far as anything is known of it.
 
     ``found`` is what ``observe_task`` returned for each.
     """
@@ -178,19 +189,22 @@ def depth_of_regions(
             ]
             for a, b in link(labels[0], labels[1]):
                 links.append((number[before, a], number[(camera, time), b]))
-    result: dict[Frame, dict[int, float]] = {frame: {} for frame in frames}
+    result: dict[Frame, dict[int, KnownDepth]] = {frame: {} for frame in frames}
     if regions_found:
         solved, belief = smooth_over_time(regions_found, sorted(links))
         for region, theta, believed in zip(regions_found, solved, belief, strict=True):
             if believed > context.config.moving_evidence:
-                result[region.frame][region.label] = float(theta)
+                result[region.frame][region.label] = KnownDepth(float(theta), True)
+            elif np.isfinite(region.matched):
+                # nobody can believe that it moves, and there it would stand still
+                result[region.frame][region.label] = KnownDepth(region.matched, False)
     return [result[frame] for frame in frames]
 
 
-def moving_depth_task(context: Context, job: tuple[Frame, dict[int, float]]) -> None:
-    """Where phase 2 begins: what stands still as settled, moving regions at the log inverse depth given.
+def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]) -> None:
+    """Where phase 2 begins: what stands still as settled, moving regions at the depth given.
 
-    Regions without one are put on the ground, and stay unexplained.
+    Regions without one are put on the ground; these and those not believed stay unexplained.
     """
     frame, depths = job
     workspace, config = context.workspace, context.config
@@ -202,12 +216,15 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, float]]) -> 
     views = _instant_views(context, frame, 1) if depths else []
     for label in range(1, int(labels.max()) + 1):
         region = labels == label
-        if label in depths:
-            matched = np.log(region_depth(instant, region, depths[label]))
-            theta[region] = matched + side_seen(matched, rays[region.ravel()], views)
-            moving[region] = MOVING
-        else:
+        if label not in depths:
             theta[region] = standing(theta, region)
+            continue
+        matched = np.log(region_depth(instant, region, depths[label].log_inverse_depth))
+        if depths[label].believed:
+            moving[region] = MOVING
+            matched = matched + side_seen(matched, rays[region.ravel()], views)
+        # nothing lies behind its background, which is known only about
+        theta[region] = np.maximum(matched, theta[region] - BEHIND)
     weight[moving != STATIC] = config.moving_sigma**-2
     workspace.write("prior", frame, theta)
     workspace.write("prior_weight", frame, weight)

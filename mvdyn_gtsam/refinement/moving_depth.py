@@ -49,6 +49,9 @@ CHANGE_OF_SPEED = 0.004
 Source: 0.002 to 0.02 and none compared on three scenes."""
 LEAST_OVERLAP = 0.2
 """Of two regions of consecutive frames that are one thing: shared pixels over those of the smaller."""
+SEEN, FARTHEST = 0.2, 0.3
+"""Evidence from which a region's own depth bounds those of the same thing, and how far beyond, in log depth,
+they may lie. Source: choice; a third nearer or farther."""
 FADING_STEPS = 24.0
 """Frames after which another frame's evidence counts 1/e."""
 ITERATIONS = 10
@@ -60,6 +63,11 @@ HULL_STEP, HULL_STEPS = 0.03, 15
 SIDE_ANGLES_DEG = (15.0, 60.0)
 """Angles between views up to which they see the same side of a thing, and from which they do not. Source:
 half the way compared with none on three rendered scenes: better from 45 degrees on but for a thin thing."""
+WITNESSED = 0.5
+"""Share of a region that another view must see move for full evidence. Source: choice: half of a thing is
+hidden from it."""
+MATCHED = 0.5
+"""Support from which images match. Source: choice."""
 LEAST_SHARE = 0.1
 """Of a region's pixels whose own depth is not denied, for these to decide. Source: choice."""
 
@@ -74,6 +82,8 @@ class RegionDepth:
     """Commonest of the region."""
     evidence: float
     """In [0, 1]: how far the images support it."""
+    matched: float = np.nan
+    """Commonest where the images match, whatever the views deny; NaN where they do not match."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +115,15 @@ def contradicted(theta: Float32, rays: Float32, views: Sequence[InstantView]) ->
     return denied
 
 
+def moving_there(theta: Float32, rays: Float32, views: Sequence[InstantView]) -> float:
+    """Largest share of the points, as in ``contradicted``, that a view sees where something moves."""
+    shares = [0.0]
+    for view in views:
+        farther, (row, column) = depth_beyond(theta, rays, view)
+        shares.append(float((np.isfinite(farther) & view.moves[row, column]).mean()))
+    return max(shares)
+
+
 def commonest(values: Float32) -> float:
     """Log of the inverse depth that most of ``values (M,)`` have."""
     edges = np.arange(values.min() - BIN, values.max() + 2.0 * BIN, BIN)
@@ -116,19 +135,26 @@ def commonest(values: Float32) -> float:
 
 def observed_depth(
     instant: Float32, region: Mask, grey: Float32, rays: Float32, views: Sequence[InstantView]
-) -> tuple[float, float]:
-    """Log inverse depth of ``region (h, w)`` that most of its pixels have in ``instant (h, w)``, and the
-    evidence for it in [0, 1]: how alike the images are there, less what a view denies.
+) -> tuple[float, float, float]:
+    """Log inverse depth of ``region (h, w)`` that most of its pixels have in ``instant (h, w)``, the evidence
+    for it in [0, 1], and what ``RegionDepth.matched`` says.
+
+    Evidence is how alike the images are there, as far as another view sees it move there and none denies it.
 
     ``grey (h, w)`` is the image and ``rays (h w, 3)`` those of its pixels.
     """
     values, own = np.log(instant[region]), rays[region.ravel()]
+    matched = commonest(values)
+    if support(grey, region, matched, rays, views) < MATCHED:
+        matched = np.nan
     kept = ~contradicted(values, own, views)
     if kept.mean() > LEAST_SHARE:
         values = values[kept]
     depth = commonest(values)
-    denied = contradicted(np.full(len(own), depth, np.float32), own, views).mean()
-    return depth, support(grey, region, depth, rays, views) * (1.0 - float(denied))
+    even = np.full(len(own), depth, np.float32)
+    witnessed = min(1.0, moving_there(even, own, views) / WITNESSED)
+    witnessed *= 1.0 - float(contradicted(even, own, views).mean())
+    return depth, support(grey, region, depth, rays, views) * witnessed, matched
 
 
 def region_depth(instant: Float32, region: Mask, log_inverse_depth: float) -> Float32:
@@ -246,7 +272,14 @@ def smooth_over_time(regions: Sequence[RegionDepth], links: Sequence[tuple[int, 
         same = group == group[number]
         fading = np.exp(-np.abs(times[same] - times[number]) / FADING_STEPS)
         belief[number] = (weight[same] * fading).max()
-    return np.asarray(solved).reshape(count), belief
+    solved = np.asarray(solved).reshape(count).copy()
+    for number in np.unique(group):
+        same = group == number
+        seen = same & (weight > SEEN)
+        if seen.any():
+            # motion that goes on evenly would leave the scene
+            solved[same] = np.clip(solved[same], solved[seen].min() - FARTHEST, solved[seen].max() + FARTHEST)
+    return solved, belief
 
 
 def _correlation(one: Float32, other: Float32) -> Float32:

@@ -10,11 +10,13 @@ import pytest
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.refinement.moving_depth import (
+    FARTHEST,
     InstantView,
     RegionDepth,
     commonest,
     contradicted,
     link,
+    moving_there,
     observed_depth,
     region_depth,
     side_seen,
@@ -104,15 +106,30 @@ def test_the_observed_depth_is_one_that_no_camera_denies() -> None:
     grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
     instant[20:33] = 2.5
     view = beside(grey, 8, np.roll(REGION, -8, axis=1))
-    found, evidence = observed_depth(instant, REGION, grey, RAYS, [view])
+    found, evidence, matched = observed_depth(instant, REGION, grey, RAYS, [view])
     assert np.exp(found) == pytest.approx(0.5, rel=0.02)
     assert evidence == 1.0
+    # most pixels lie where the images do not match
+    assert np.isnan(matched)
 
 
 def test_a_depth_that_is_denied_is_no_evidence() -> None:
     grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
     assert observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8)])[1] == 1.0
-    assert observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8, ~EVERYWHERE)])[1] == 0.0
+    _, evidence, matched = observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8, ~EVERYWHERE)])
+    # but a still thing may well stand there
+    assert evidence == 0.0 and np.exp(matched) == pytest.approx(0.5, rel=0.02)
+
+
+def test_a_thing_that_no_view_sees_move_is_not_believed() -> None:
+    theta = np.full(int(REGION.sum()), np.log(0.5), np.float32)
+    half = np.roll(REGION, -8, axis=1)
+    half[30:] = False
+    rays = RAYS[REGION.ravel()]
+    assert moving_there(theta, rays, [beside(textured(), 8, ~EVERYWHERE)]) == 0.0
+    assert moving_there(theta, rays, [beside(textured(), 8, half)]) == pytest.approx(0.5)
+    assert moving_there(theta, rays, [beside(textured(), 80, EVERYWHERE)]) == 0.0
+    assert moving_there(theta, rays, []) == 0.0
 
 
 def from_the_side(degrees: float, radius: float) -> InstantView:
@@ -180,6 +197,14 @@ def test_frames_without_evidence_take_it_from_the_nearest_with() -> None:
     # it walks evenly, also before anybody saw it
     np.testing.assert_allclose(solved, -0.01 * np.arange(20), atol=0.02)
     assert (np.diff(belief[:8]) > 0.0).all()
+
+
+def test_even_motion_ends_where_the_scene_does() -> None:
+    """Seen for ten frames only, it would be 9 times as far off after 100 more."""
+    seen = {t: float(t < 10) for t in range(110)}
+    regions = [RegionDepth((0, t), 1, -0.02 * t if t < 10 else 0.0, seen[t]) for t in range(110)]
+    solved, _ = smooth_over_time(regions, chain(110))
+    assert solved.min() >= -0.18 - FARTHEST - 0.05
 
 
 def test_regions_apart_do_not_touch_each_other() -> None:
