@@ -67,8 +67,9 @@ class KnownDepth:
     """Of a moving region of a frame."""
 
     log_inverse_depth: float
-    believed: bool
-    """Whether the images of this instant or those near support that it moves there."""
+    moving: int
+    """``MOVING`` where the images of this instant or those near support that it moves there; ``STATIC`` where
+    another camera sees it stand still; else ``UNEXPLAINED``."""
 
 
 def free_space_task(context: Context, frame: Frame) -> None:
@@ -193,11 +194,13 @@ def depth_of_regions(
     if regions_found:
         solved, belief = smooth_over_time(regions_found, sorted(links))
         for region, theta, believed in zip(regions_found, solved, belief, strict=True):
-            if believed > context.config.moving_evidence:
-                result[region.frame][region.label] = KnownDepth(float(theta), True)
+            if region.still:
+                result[region.frame][region.label] = KnownDepth(region.matched, STATIC)
+            elif believed > context.config.moving_evidence:
+                result[region.frame][region.label] = KnownDepth(float(theta), MOVING)
             elif np.isfinite(region.matched):
                 # nobody can believe that it moves, and there it would stand still
-                result[region.frame][region.label] = KnownDepth(region.matched, False)
+                result[region.frame][region.label] = KnownDepth(region.matched, UNEXPLAINED)
     return [result[frame] for frame in frames]
 
 
@@ -220,12 +223,12 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]
             theta[region] = standing(theta, region)
             continue
         matched = np.log(region_depth(instant, region, depths[label].log_inverse_depth))
-        if depths[label].believed:
-            moving[region] = MOVING
+        moving[region] = depths[label].moving
+        if depths[label].moving == MOVING:
             matched = matched + side_seen(matched, rays[region.ravel()], views)
         # nothing lies behind its background, which is known only about
         theta[region] = np.maximum(matched, theta[region] - BEHIND)
-    weight[moving != STATIC] = config.moving_sigma**-2
+    weight[labels > 0] = config.moving_sigma**-2
     workspace.write("prior", frame, theta)
     workspace.write("prior_weight", frame, weight)
     workspace.write("moving", frame, moving)

@@ -106,19 +106,31 @@ def test_the_observed_depth_is_one_that_no_camera_denies() -> None:
     grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
     instant[20:33] = 2.5
     view = beside(grey, 8, np.roll(REGION, -8, axis=1))
-    found, evidence, matched = observed_depth(instant, REGION, grey, RAYS, [view])
+    found, evidence, matched, still = observed_depth(instant, REGION, grey, RAYS, [view])
     assert np.exp(found) == pytest.approx(0.5, rel=0.02)
     assert evidence == 1.0
     # most pixels lie where the images do not match
-    assert np.isnan(matched)
+    assert np.isnan(matched) and not still
 
 
 def test_a_depth_that_is_denied_is_no_evidence() -> None:
     grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
     assert observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8)])[1] == 1.0
-    _, evidence, matched = observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8, ~EVERYWHERE)])
+    _, evidence, matched, still = observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8, ~EVERYWHERE)])
     # but a still thing may well stand there
-    assert evidence == 0.0 and np.exp(matched) == pytest.approx(0.5, rel=0.02)
+    assert evidence == 0.0 and np.exp(matched) == pytest.approx(0.5, rel=0.02) and not still
+
+
+def test_what_another_view_sees_stand_still_there_does_not_move() -> None:
+    """The wall 5 m away, which another camera sees 3 px to the left."""
+    grey, instant = textured(), np.full(SHAPE, 0.2, np.float32)
+    jTi = np.eye(4)
+    jTi[0, 3] = -3.0 * 5.0 / 70.0
+    wall = np.full(SHAPE, np.log(0.2), np.float32)
+    view = InstantView(np.roll(grey, -3, axis=1), INTRINSICS, jTi, wall, ~EVERYWHERE)
+    found, evidence, matched, still = observed_depth(instant, REGION, grey, RAYS, [view])
+    assert still and evidence == 0.0
+    assert np.exp(found) == np.exp(matched) == pytest.approx(0.2, rel=0.02)
 
 
 def test_a_thing_that_no_view_sees_move_is_not_believed() -> None:
