@@ -74,26 +74,8 @@ class KnownDepth:
 
 def free_space_task(context: Context, frame: Frame) -> None:
     """Add to where the static model fails in a frame what other times and cameras see through."""
-    workspace, config, wTc = context.workspace, context.config, context.poses()
-    (camera, time), view = frame, workspace.views[frame[0]]
-    offsets = [sign * offset for offset in config.witness_offsets for sign in (-1, 1)]
-    others = [(camera, time + offset) for offset in offsets]
-    others += [
-        (other, time + offset)
-        for other in context.group_of(camera)
-        if other != camera
-        for offset in (0, *offsets)
-    ]
-    views = [
-        DepthView(
-            context.image("first", j),
-            context.trust(j),
-            workspace.views[j[0]].intrinsics,
-            invert_pose(wTc[j]) @ wTc[frame],
-        )
-        for j in others
-        if 0 <= j[1] < workspace.frame_count
-    ]
+    workspace, config, view = context.workspace, context.config, context.workspace.views[frame[0]]
+    views = _witnesses(context, frame)
     theta = context.image("first", frame)
     every = (slice(FREE_SPACE_RASTER // 2, None, FREE_SPACE_RASTER),) * 2
     rays = view.rays.reshape(*view.shape, 3)[every]
@@ -109,6 +91,29 @@ def free_space_task(context: Context, frame: Frame) -> None:
         if settled[region].mean() < SETTLED_SHARE:
             found[found == label] = 0
     workspace.write("fails", frame, np.maximum(np.asarray(workspace.read("fails", frame)), found > 0))
+
+
+def _witnesses(context: Context, frame: Frame) -> list[DepthView]:
+    """All cameras of the group at other times, and the other cameras at this one, with their first depth."""
+    workspace, wTc, (camera, time) = context.workspace, context.poses(), frame
+    offsets = [sign * offset for offset in context.config.witness_offsets for sign in (-1, 1)]
+    others = [(camera, time + offset) for offset in offsets]
+    others += [
+        (other, time + offset)
+        for other in context.group_of(camera)
+        if other != camera
+        for offset in (0, *offsets)
+    ]
+    return [
+        DepthView(
+            context.image("first", j),
+            context.trust(j),
+            workspace.views[j[0]].intrinsics,
+            invert_pose(wTc[j]) @ wTc[frame],
+        )
+        for j in others
+        if 0 <= j[1] < workspace.frame_count
+    ]
 
 
 def settle_task(context: Context, frame: Frame) -> None:
