@@ -119,6 +119,11 @@ def test_ground_truth_without_the_means_to_score_is_said_before_the_work(
 
 
 @pytest.mark.slow
+def _heed_ctrl_c() -> None:
+    """A job that a shell put into the background ignores Ctrl-C, and hands that down to its children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_two_captures_interrupted_by_ctrl_c_and_gone_on_with(tmp_path: Path) -> None:
     folder, out = tmp_path / "clips", tmp_path / "out"
     for cameras, frames in ((2, 10), (2, 11)):
@@ -127,7 +132,9 @@ def test_two_captures_interrupted_by_ctrl_c_and_gone_on_with(tmp_path: Path) -> 
     next((folder / "broken" / "cam0").iterdir()).write_bytes(b"")
     command = [sys.executable, "-m", "mvdyn_gtsam", "batch", str(folder), "--out", str(out)]
     command += ["--stage", "tracking", "--workers", "2"]
-    first = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    first = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=_heed_ctrl_c
+    )
     while not list(out.glob("quick*/manifest.json")):
         assert first.poll() is None
         time.sleep(0.05)
