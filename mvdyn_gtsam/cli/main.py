@@ -16,6 +16,7 @@ from rich.logging import RichHandler
 
 from mvdyn_gtsam.cli import batch, compare, config, demo, evaluate, export, reconstruct, scene
 from mvdyn_gtsam.errors import MvdynError
+from mvdyn_gtsam.memory import keep_freed_memory
 
 EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERNAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -81,6 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``mvdyn`` with ``argv`` (default: the process's) and return its exit code."""
     # Before numpy is loaded: BLAS threads beside our own make many small systems seven times slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    keep_freed_memory()
     parser = build_parser()
     try:
         arguments = parser.parse_args(argv)

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from mvdyn_gtsam.memory import keep_freed_memory
+
 PIXEL_CENTRE = 0.5
 """COLMAP puts the centre of the first pixel at 0.5."""
 
@@ -29,6 +31,7 @@ none beyond use, 150 six and two, 100 five and two, all tracks five and two."""
 
 
 def main(source: str, target: str) -> int:
+    keep_freed_memory()
     problem = np.load(source)
     pycolmap.logging.minloglevel = 3
     pycolmap.set_random_seed(0)
