@@ -63,13 +63,17 @@ def static_residual(inverse_depth: Float32, edges: Sequence[Edge]) -> Float32:
         sure = (edge.weight >= SURE_WEIGHT) & terms.valid
         residual = terms.residual[sure]
         row[edge.pixels[sure]] = np.hypot(residual[:, 0], residual[:, 1])
-    if not own:
-        return np.full(inverse_depth.shape, np.nan, np.float32)
-    # median without nanmedian's warnings: NaN sort to the end
-    table.sort(axis=0)
-    count = np.isfinite(table).sum(axis=0)
-    middle = np.maximum(count - 1, 0) // 2
-    return np.take_along_axis(table, middle[None], axis=0)[0].reshape(inverse_depth.shape)
+    return known_median(table).reshape(inverse_depth.shape)
+
+
+def known_median(table: Float32) -> Float32:
+    """Lower median ``(...)`` of ``table (K, ...)`` over the first axis without its NaN; NaN where all are."""
+    if not len(table):
+        return np.full(table.shape[1:], np.nan, np.float32)
+    # no nanmedian: it warns where all are NaN, and these sort to the end
+    table = np.sort(table, axis=0)
+    middle = np.maximum(np.isfinite(table).sum(axis=0) - 1, 0) // 2
+    return np.take_along_axis(table, middle[None], axis=0)[0]
 
 
 def failing_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[np.uint8]:

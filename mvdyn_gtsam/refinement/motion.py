@@ -31,6 +31,8 @@ from mvdyn_gtsam.refinement.moving_depth import (
     smooth_over_time,
 )
 from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
+from mvdyn_gtsam.refinement.patches import Picture
+from mvdyn_gtsam.refinement.static_regions import StaticRegions, static_regions
 
 Mask = npt.NDArray[np.bool_]
 Labels = npt.NDArray[np.int32]
@@ -70,6 +72,26 @@ class KnownDepth:
     moving: int
     """``MOVING`` where the images of this instant or those near support that it moves there; ``STATIC`` where
     another camera sees it stand still; else ``UNEXPLAINED``."""
+
+
+def static_among(context: Context, frame: Frame, fails: npt.NDArray[np.uint8]) -> StaticRegions:
+    """Of the regions of a frame where flow ``fails (h, w)`` those that other times of the camera know."""
+    workspace, wTc, (camera, time) = context.workspace, context.poses(), frame
+    view = workspace.views[camera]
+    times = [time + sign * offset for offset in context.config.match_offsets for sign in (-1, 1)]
+    others = [
+        Picture(context.luminance((camera, t)), view.intrinsics, invert_pose(wTc[camera, t]) @ wTc[frame])
+        for t in times
+        if 0 <= t < workspace.frame_count
+    ]
+    return static_regions(
+        regions(fails, context.config),
+        context.luminance(frame),
+        context.image("swept", frame),
+        view.rays,
+        others,
+        context.config.match_likeness,
+    )
 
 
 def free_space_task(context: Context, frame: Frame) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -22,7 +21,7 @@ from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.free_space import AGREES, depth_beyond
-from mvdyn_gtsam.refinement.views import pixels_seen
+from mvdyn_gtsam.refinement.patches import likeness
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -32,10 +31,6 @@ TOLERANCE = 0.15
 """Pixels of a region whose own depth is within this (relative) of the region's keep it."""
 BIN = 0.1
 """Of the histogram of log depth that finds the commonest."""
-PATCH = 9
-"""Side of the patches compared, px of the view."""
-NOISE = 2.0
-"""Grey levels: patches with less contrast say nothing."""
 NO_SUPPORT, FULL_SUPPORT = 0.08, 0.2
 """Correlation at which a depth counts nothing and fully. Source: wrong depths of regions of dynamic_human had
 0.07 to 0.13, right ones 0.15 to 0.3."""
@@ -231,14 +226,9 @@ def support(
     """
     best, inverse_depth = 0.0, np.full(len(rays), np.exp(log_inverse_depth), np.float32)
     for view in views:
-        pixels, front = pixels_seen(inverse_depth, rays, view.jTi, view.intrinsics)
-        at = pixels.reshape(*grey.shape, 2)
-        warped = cv2.remap(
-            view.grey, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=-1e3
-        )
-        seen = (warped >= 0.0) & front.reshape(grey.shape) & region
-        likeness = _correlation(grey, np.where(warped >= 0.0, warped, grey).astype(np.float32))
-        best = max(best, float(likeness[seen].sum() / np.count_nonzero(region)))
+        alike, inside = likeness(grey, inverse_depth, rays, view)
+        seen = inside & region
+        best = max(best, float(alike[seen].sum() / np.count_nonzero(region)))
     return float(np.clip((best - NO_SUPPORT) / (FULL_SUPPORT - NO_SUPPORT), 0.0, 1.0))
 
 
@@ -298,15 +288,3 @@ def smooth_over_time(regions: Sequence[RegionDepth], links: Sequence[tuple[int, 
             # motion that goes on evenly would leave the scene
             solved[same] = np.clip(solved[same], solved[seen].min() - FARTHEST, solved[seen].max() + FARTHEST)
     return solved, belief
-
-
-def _correlation(one: Float32, other: Float32) -> Float32:
-    """Normalised correlation ``(h, w)`` of the patches of two images, not below zero."""
-    size = (PATCH, PATCH)
-    mean_one, mean_other = cv2.blur(one, size), cv2.blur(other, size)
-    covariance = cv2.blur(one * other, size) - mean_one * mean_other
-    variances = [
-        np.maximum(cv2.blur(image * image, size) - mean * mean, 0.0) + NOISE**2
-        for image, mean in ((one, mean_one), (other, mean_other))
-    ]
-    return np.asarray(np.maximum(covariance, 0.0) / np.sqrt(variances[0] * variances[1]), np.float32)
