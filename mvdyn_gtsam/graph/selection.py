@@ -49,30 +49,41 @@ def predicted_overlap(
     A point counts as visible where its depth differs from the candidate's by less than
     ``occlusion_tolerance`` (relative).
     """
-    inside, visible, parallax = (np.zeros(len(candidates)) for _ in range(3))
-    rays = _normalised(w_points - w_centre)
-    for index, view in enumerate(candidates):
-        cRw = view.wTc[:3, :3].T
-        offsets = w_points - view.wTc[:3, 3]
-        points = offsets @ cRw.T
-        z = points[:, 2]
-        fx, fy, cx, cy = view.intrinsics
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = fx * points[:, 0] / z + cx, fy * points[:, 1] / z + cy
-            seen = (z > 0) & (x >= 0) & (y >= 0) & (x <= view.size[0] - 1) & (y <= view.size[1] - 1)
-        inside[index] = np.mean(seen)
-        if not seen.any():
-            parallax[index] = np.nan
-            continue
-        rows, cols = view.depth.shape
-        col = np.clip(np.rint((x[seen] - view.origin[0]) / view.stride).astype(int), 0, cols - 1)
-        row = np.clip(np.rint((y[seen] - view.origin[1]) / view.stride).astype(int), 0, rows - 1)
-        with np.errstate(invalid="ignore"):
-            same = np.abs(np.log(z[seen] / view.depth[row, col])) < occlusion_tolerance
-        visible[index] = same.sum() / len(w_points)
-        cosine = np.einsum("nc,nc->n", _normalised(offsets[seen]), rays[seen])
-        parallax[index] = np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    return Overlap(inside, visible, parallax)
+    if not candidates:
+        return Overlap(*(np.zeros(0) for _ in range(3)))
+    # all candidates at once: one after the other they took four times as long
+    wTc = np.stack([view.wTc for view in candidates])
+    fx, fy, cx, cy = np.stack([view.intrinsics for view in candidates]).T[..., None]
+    last_x, last_y = np.array([view.size for view in candidates]).T[..., None] - 1
+    offsets = w_points - wTc[:, None, :3, 3]
+    points = offsets @ wTc[:, :3, :3]
+    z = points[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = fx * points[..., 0] / z + cx, fy * points[..., 1] / z + cy
+        seen = (z > 0) & (x >= 0) & (y >= 0) & (x <= last_x) & (y <= last_y)
+        surface = _depths_at(candidates, np.where(seen, x, 0.0), np.where(seen, y, 0.0))
+        same = seen & (np.abs(np.log(z / surface)) < occlusion_tolerance)
+    cosine = np.einsum("mnc,nc->mn", _normalised(offsets), _normalised(w_points - w_centre))
+    angle = np.where(seen, np.arccos(np.clip(cosine, -1.0, 1.0)), np.inf)
+    return Overlap(seen.mean(axis=1), same.mean(axis=1), np.degrees(_median_of_finite(angle)))
+
+
+def _depths_at(views: Sequence[View], x: Array, y: Array) -> Array:
+    """``(M, N)``: each view's depth at the grid point nearest to its pixels ``x``, ``y (M, N)``."""
+    origin_x, origin_y = np.array([view.origin for view in views]).T[..., None]
+    rows, cols = np.array([view.depth.shape for view in views]).T[..., None]
+    stride = np.array([[view.stride] for view in views])
+    first = np.cumsum([0, *(view.depth.size for view in views[:-1])])[:, None]
+    col = np.clip(np.rint((x - origin_x) / stride).astype(int), 0, cols - 1)
+    row = np.clip(np.rint((y - origin_y) / stride).astype(int), 0, rows - 1)
+    return np.concatenate([view.depth.ravel() for view in views])[first + row * cols + col]
+
+
+def _median_of_finite(values: Array) -> Array:
+    """``(M,)`` of each row of ``values (M, N)``, in which inf is no value; NaN where there is none."""
+    ordered, count, row = np.sort(values, axis=1), np.isfinite(values).sum(axis=1), np.arange(len(values))
+    middle = 0.5 * (ordered[row, np.maximum(count - 1, 0) // 2] + ordered[row, count // 2 - (count == 0)])
+    return np.where(count > 0, middle, np.nan)
 
 
 def choose_spread(
@@ -106,5 +117,5 @@ def edge_score(overlap: Overlap, minimum: float, max_parallax_deg: float) -> Arr
 
 
 def _normalised(vectors: Array) -> Array:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)

@@ -1,9 +1,12 @@
 """Predicted overlap and the choice of whom to connect."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from mvdyn_gtsam.geometry import pixel_rays
 from mvdyn_gtsam.graph.selection import Overlap, View, choose_spread, edge_score, predicted_overlap
@@ -34,6 +37,52 @@ def view(
 
 def overlap_with(*views: View, depth: float = 4.0) -> Overlap:
     return predicted_overlap(wall_points(depth), np.zeros(3), views, occlusion_tolerance=0.1)
+
+
+def overlap_one_by_one(points: np.ndarray, centre: np.ndarray, views: list[View]) -> Overlap:
+    """``predicted_overlap`` as it reads in prose."""
+    inside, visible, parallax = (np.zeros(len(views)) for _ in range(3))
+    for index, one in enumerate(views):
+        in_view = (points - one.wTc[:3, 3]) @ one.wTc[:3, :3]
+        angles = []
+        for point, (px, py, z) in zip(points, in_view, strict=True):
+            if z <= 0:
+                continue
+            x, y = one.intrinsics[:2] * (px, py) / z + one.intrinsics[2:]
+            if not (0 <= x <= one.size[0] - 1 and 0 <= y <= one.size[1] - 1):
+                continue
+            inside[index] += 1 / len(points)
+            row = min(max(round((y - one.origin[1]) / one.stride), 0), one.depth.shape[0] - 1)
+            col = min(max(round((x - one.origin[0]) / one.stride), 0), one.depth.shape[1] - 1)
+            visible[index] += (abs(np.log(z / one.depth[row, col])) < 0.1) / len(points)
+            first, second = point - centre, point - one.wTc[:3, 3]
+            cosine = first @ second / np.linalg.norm(first) / np.linalg.norm(second)
+            angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        parallax[index] = np.median(angles) if angles else np.nan
+    return Overlap(inside, visible, parallax)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_all_candidates_at_once_are_each_as_alone(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    views = []
+    for _ in range(4):
+        wRc = Rotation.from_rotvec(random.normal(0, 0.5, 3)).as_matrix()
+        one = view(tuple(random.normal(0, 1, 3)), wRc=wRc)
+        depth = random.uniform(2.0, 6.0, (SHAPE[0] + random.integers(3), SHAPE[1]))
+        depth[random.random(depth.shape) < 0.1] = np.nan
+        views.append(replace(one, depth=depth, size=(int(random.integers(80, 200)), HEIGHT)))
+    views.append(view(wRc=np.diag([-1.0, 1.0, -1.0])))
+    points = wall_points(4.0)[:: 1 + int(random.integers(3))] * random.uniform(0.5, 2.0)
+    found = predicted_overlap(points, np.zeros(3), views, occlusion_tolerance=0.1)
+    expected = overlap_one_by_one(points, np.zeros(3), views)
+    np.testing.assert_allclose(found.inside, expected.inside, atol=1e-12)
+    np.testing.assert_allclose(found.visible, expected.visible, atol=1e-12)
+    np.testing.assert_allclose(found.parallax_deg, expected.parallax_deg, atol=1e-6)
+
+
+def test_without_candidates_there_is_no_overlap() -> None:
+    assert len(overlap_with().inside) == 0
 
 
 def test_the_same_view_sees_everything_without_parallax() -> None:
