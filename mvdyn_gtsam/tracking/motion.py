@@ -14,6 +14,12 @@ from mvdyn_gtsam.geometry import interpolate_pose, invert_pose, transform_points
 
 Array = npt.NDArray[np.float64]
 
+MOST = 0.7
+"""Share of inliers below which a pose is in doubt."""
+NEARLY_ALL = 0.8
+"""Share of inliers from which no other pose can do better: of 94 on hololens_office_2seg every prediction led
+to the same."""
+
 
 @dataclass(frozen=True)
 class PoseFit:
@@ -126,12 +132,17 @@ def pnp_pose(seen: Correspondences, intrinsics: Array, threshold_px: float) -> A
 def locate(
     seen: Correspondences, intrinsics: Array, predictions: Sequence[Array], robust_px: float
 ) -> PoseFit:
-    """Best pose from several predictions; PnP joins them where none explains most of the measurement."""
-    fits = [refine_pose(seen, intrinsics, wTc, robust_px) for wTc in predictions]
-    if max(fit.inlier_fraction for fit in fits) < 0.7:
-        wTc = pnp_pose(seen, intrinsics, 4.0 * robust_px)
-        if wTc is not None:
-            fits.append(refine_pose(seen, intrinsics, wTc, robust_px))
+    """Best pose from several predictions, the first of which that explains nearly all of the measurement
+    suffices; PnP joins them where none explains most of it."""
+    fits: list[PoseFit] = []
+    for wTc in predictions:
+        fits.append(refine_pose(seen, intrinsics, wTc, robust_px))
+        if fits[-1].inlier_fraction > NEARLY_ALL:
+            return fits[-1]
+    if max(fit.inlier_fraction for fit in fits) < MOST:
+        unguided = pnp_pose(seen, intrinsics, 4.0 * robust_px)
+        if unguided is not None:
+            fits.append(refine_pose(seen, intrinsics, unguided, robust_px))
     return min(fits, key=lambda fit: fit.cost)
 
 
