@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from time import perf_counter
 
@@ -28,6 +29,12 @@ from mvdyn_gtsam.tracking.motion import Correspondences, PoseFit, locate, world_
 from mvdyn_gtsam.tracking.normalise import normalised_start
 
 Array = npt.NDArray[np.float64]
+
+NOTHING = 0.0025
+"""Mean weight below which a connection found nothing at all, not even a little."""
+NEAR = 2
+"""Keyframes away at which a connection that found nothing speaks for its neighbours. On hololens_office_2seg
+93 of 146 connections between cameras found nothing, nearly all of them in one unbroken stretch of time."""
 
 
 class TrackState:
@@ -108,7 +115,10 @@ class TrackState:
         self.graph.add(edges)
 
     def edges_to_other_cameras(self, keyframe: Keyframe, per_camera: int) -> list[Edge]:
-        """New connections to keyframes of the other cameras of its group whose images can be had."""
+        """New connections to keyframes of the other cameras of its group whose images can be had.
+
+        Without those whose neighbours in time found nothing.
+        """
         edges: list[Edge] = []
         if not self.graph_config.inter_camera:
             return edges
@@ -119,7 +129,22 @@ class TrackState:
             edges += inter_camera_edges(
                 keyframe, others, self.views, self.graph, self.graph_config, per_camera
             )
-        return edges
+        return [edge for edge in edges if not self._in_vain(edge)]
+
+    def _in_vain(self, edge: Edge) -> bool:
+        """Whether all that was measured between keyframes next to its own in time found nothing."""
+        found = [
+            max(i.flows[j.frame].mean_weight, j.flows[i.frame].mean_weight)
+            for i in self._around(edge.i)
+            for j in self._around(edge.j)
+            if j.frame in i.flows
+        ]
+        return bool(found) and max(found) < NOTHING
+
+    def _around(self, frame: Frame) -> list[Keyframe]:
+        track = self.tracks[frame[0]]
+        position = bisect_left(track, frame[1], key=lambda keyframe: keyframe.time)
+        return track[max(0, position - NEAR) : position + NEAR + 1]
 
     def priors(self, keyframe: Keyframe) -> list[gtsam.NonlinearFactor]:
         """The start's word on this frame, and the gauge at the first keyframe of each group."""
