@@ -26,6 +26,11 @@ logger = logging.getLogger(__name__)
 
 Image = npt.NDArray[np.uint8]
 
+KEPT_BYTES = 48 * 2**20
+"""Decoded frames that a camera's stream keeps, 85 of 512x384: of a short clip all, for tracking reads it five
+times. One sent to another process keeps few: there are several of those, each with a part of the video."""
+FEWEST_KEPT = 4
+
 
 class MediaStream(FrameStream):
     """What a camera's own file or files hold, before any offset, crop or undistortion."""
@@ -50,6 +55,11 @@ class _FrameCache:
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._frames: OrderedDict[int, Image] = OrderedDict()
+
+    @staticmethod
+    def of_size(width: int, height: int) -> _FrameCache:
+        """Room for ``KEPT_BYTES`` of such frames."""
+        return _FrameCache(max(FEWEST_KEPT, KEPT_BYTES // (3 * width * height)))
 
     def get(self, time: int) -> Image | None:
         if time in self._frames:
@@ -90,7 +100,7 @@ class ImageStream(MediaStream):
                     f"{path}: {size[0]}x{size[1]} pixels, but {paths[0].name} in the same folder has "
                     f"{self.width}x{self.height}; give every image of a camera one size"
                 )
-        self._cache = _FrameCache(4)
+        self._cache = _FrameCache.of_size(self.width, self.height)
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -106,7 +116,7 @@ class ImageStream(MediaStream):
         return frame
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_cache": _FrameCache(4)}
+        return self.__dict__ | {"_cache": _FrameCache(FEWEST_KEPT)}
 
 
 class VideoStream(MediaStream):
@@ -135,6 +145,7 @@ class VideoStream(MediaStream):
             raise CaptureError(f"{path}: not a single frame can be decoded; copy it again or re-encode it")
         _, first = video.retrieve()
         self.height, self.width = (int(n) for n in first.shape[:2])
+        self._cache = _FrameCache.of_size(self.width, self.height)
         rate = float(video.get(cv2.CAP_PROP_FPS))
         self.fps = rate if np.isfinite(rate) and rate > 0 else None
         self.promised_count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -180,7 +191,7 @@ class VideoStream(MediaStream):
 
     def _reset(self) -> None:
         self._owner = os.getpid()
-        self._cache = _FrameCache(4)
+        self._cache = _FrameCache(FEWEST_KEPT)
         self._video: Any = None
         self._inherited = None
         self._position = -1  # the frame grabbed last
@@ -298,7 +309,7 @@ class UndistortedStream:
         """``intrinsics`` is ``(3, 3)``; ``distortion`` in OpenCV order (4, 5 or 8 numbers)."""
         self._source, self._intrinsics, self._distortion = source, intrinsics, distortion
         self._maps: tuple[Any, Any] | None = None
-        self._cache = _FrameCache(4)
+        self._cache = _FrameCache(FEWEST_KEPT)
 
     def __len__(self) -> int:
         return len(self._source)
@@ -324,4 +335,4 @@ class UndistortedStream:
         return self._maps
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_maps": None, "_cache": _FrameCache(4)}
+        return self.__dict__ | {"_maps": None, "_cache": _FrameCache(FEWEST_KEPT)}

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mvdyn_gtsam.capture import images, streams
 from mvdyn_gtsam.capture.streams import (
     CroppedStream,
     Image,
@@ -79,7 +80,9 @@ def test_video_in_order(video: Path) -> None:
 @given(times=st.lists(st.integers(0, COUNT - 1), min_size=1, max_size=15))
 @settings(max_examples=20)
 def test_video_in_any_order(video: Path, times: list[int]) -> None:
-    stream = VideoStream(video)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(streams, "KEPT_BYTES", 0)
+        stream = VideoStream(video)
     assert [frame_number(stream.read(time)) for time in times] == times
 
 
@@ -209,6 +212,38 @@ def test_images_in_the_order_given(tmp_path: Path) -> None:
     assert frame_number(pickle.loads(pickle.dumps(stream)).read(4)) == 4
     with pytest.raises(IndexError):
         stream.read(6)
+
+
+@pytest.mark.parametrize("kept", [3, 8, 100])
+def test_frames_are_decoded_again_only_where_they_no_longer_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int
+) -> None:
+    monkeypatch.setattr(streams, "KEPT_BYTES", kept * WIDTH * HEIGHT * 3)
+    stream = ImageStream(write_images(tmp_path, range(10)))
+    decoded: list[Path] = []
+
+    def read_image(path: Path) -> Image:
+        decoded.append(path)
+        return images.read_image(path)
+
+    monkeypatch.setattr(streams, "read_image", read_image)
+    room = max(kept, streams.FEWEST_KEPT)
+    for time in [*range(10), *range(9, -1, -1)]:
+        assert frame_number(stream.read(time)) == time
+    assert len(decoded) == 10 + max(0, 10 - room)
+    sent = pickle.loads(pickle.dumps(stream))
+    assert [frame_number(sent.read(time)) for time in range(10)] == list(range(10))
+    assert len(sent._cache._frames) == streams.FEWEST_KEPT
+
+
+def test_of_a_video_a_second_look_decodes_nothing(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = VideoStream(video)
+    monkeypatch.setattr(cv2, "VideoCapture", _InexactCapture)
+    monkeypatch.setattr(_InexactCapture, "opened", 0)
+    for _ in range(2):
+        assert [frame_number(stream.read(time)) for time in range(COUNT)] == list(range(COUNT))
+    assert _InexactCapture.opened == 1
+    assert len(stream._cache._frames) == COUNT
 
 
 def test_image_of_another_size_is_named(tmp_path: Path) -> None:
