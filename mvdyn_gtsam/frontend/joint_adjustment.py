@@ -42,7 +42,7 @@ class AdjustmentConfig:
 
     points_per_camera: int = 800
     """Points of one camera alone that enter. Source: choice, time."""
-    search_px: tuple[float, ...] = (40.0, 20.0, 8.0, 4.0)
+    search_px: tuple[float, ...] = (40.0, 12.0, 4.0)
     """Radius of each round of looking for points in frames that should see them. Source: choice."""
     similarity: float = 0.88
     """Cosine of two descriptors from which they may be one point. Source: experiments/wide_baseline.py."""
