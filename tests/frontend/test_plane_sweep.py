@@ -261,6 +261,7 @@ def test_the_ladder_covers_what_is_known_and_more() -> None:
         ("window", 4),
         ("window", 1),
         ("temporal_offsets", (0, 8)),
+        ("least_shared", 1.5),
         ("noise", 0.0),
         ("prior_tolerance", 0.0),
         ("edge_contrast", 0.0),

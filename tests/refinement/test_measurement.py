@@ -1,0 +1,56 @@
+"""Which other times a frame is compared with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvdyn_gtsam.capture.model import Camera
+from mvdyn_gtsam.frontend.plane_sweep import SweepConfig
+from mvdyn_gtsam.refinement.measurement import other_times
+from mvdyn_gtsam.refinement.views import DenseView
+from mvdyn_gtsam.refinement.workspace import Workspace
+
+FRAMES, DEPTH, FOCAL, WIDTH = 40, 2.0, 30.0, 32
+CONFIG = SweepConfig(temporal_offsets=(4, 16), least_shared=0.6)
+
+
+@pytest.fixture
+def wall(tmp_path: Path) -> Workspace:
+    """One camera before a wall."""
+    view = DenseView.of(Camera("c", WIDTH, 24, FOCAL, FOCAL, 15.5, 11.5), 1.0)
+    made = Workspace(tmp_path, (view,), FRAMES)
+    made.prepare("settings")
+    made.create("tracked")
+    for time in range(FRAMES):
+        made.write("tracked", (0, time), np.full(view.shape, 1.0 / DEPTH, np.float32))
+    return made
+
+
+def moving(px_per_frame: float) -> np.ndarray:
+    """Poses ``(1, FRAMES, 4, 4)`` from which the wall passes by at that speed."""
+    wTc = np.tile(np.eye(4), (1, FRAMES, 1, 1))
+    wTc[0, :, 0, 3] = px_per_frame * DEPTH / FOCAL * np.arange(FRAMES)
+    return wTc
+
+
+def test_a_slow_camera_is_compared_at_the_distances_asked_for(wall: Workspace) -> None:
+    assert other_times(wall, (0, 20), moving(0.1), CONFIG) == [4, 16, 24, 36]
+
+
+def test_a_fast_one_nearer_where_enough_is_shared(wall: Workspace) -> None:
+    # 2 px per frame: 4 frames share three quarters of the view, 16 and 8 less than half
+    assert other_times(wall, (0, 20), moving(2.0), CONFIG) == [16, 24]
+    # 40 % are gone after 12.8 px: 2 frames
+    assert other_times(wall, (0, 20), moving(5.0), CONFIG) == [18, 22]
+
+
+def test_the_fastest_is_compared_with_its_neighbours(wall: Workspace) -> None:
+    assert other_times(wall, (0, 20), moving(100.0), CONFIG) == [19, 21]
+
+
+def test_at_the_ends_of_the_video_only_what_there_is(wall: Workspace) -> None:
+    assert other_times(wall, (0, 0), moving(0.1), CONFIG) == [4, 16]
+    assert other_times(wall, (0, FRAMES - 3), moving(0.1), CONFIG) == [21, 33, 39]
