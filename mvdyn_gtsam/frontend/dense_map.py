@@ -23,10 +23,10 @@ from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_depth import interpolate_sparse_depth
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, FlowConfig, GridFlow, Image, sample_pair, to_grey
 from mvdyn_gtsam.frontend.grid import Grid
-from mvdyn_gtsam.frontend.grid_flow import OneWayFlow, measure_grid, measure_grid_seeded
+from mvdyn_gtsam.frontend.grid_flow import GridView, OneWayFlow, measure_grid, measure_grid_predicted
 from mvdyn_gtsam.frontend.guided_flow import predicted_flow
 from mvdyn_gtsam.frontend.single_camera import CameraMap
-from mvdyn_gtsam.geometry import invert_pose, pixel_rays, transform_points
+from mvdyn_gtsam.geometry import backproject, invert_pose, pixel_rays, project, transform_points
 
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -157,17 +157,31 @@ def _measure(
     """Flow at the grid between two frames of one camera, given as image and rough depth."""
     (image_i, depth_i), (image_j, depth_j) = first, second
     intrinsics = camera.intrinsics
-    seed = predicted_flow(depth_i, intrinsics, intrinsics, jTi, image_j.shape)
-    sparse = seed[::8, ::8]
-    motion = np.nanmedian(np.linalg.norm(sparse, axis=-1)) if np.isfinite(sparse).any() else np.inf
-    if motion < config.far_motion * camera.width:
-        if isinstance(flow, OneWayFlow):
-            return measure_grid(flow, image_i, image_j, grid, grid)[0]
-        return sample_pair(flow.measure(image_i, image_j), grid, grid)[0]
-    seed_back = predicted_flow(depth_j, intrinsics, intrinsics, invert_pose(jTi), image_i.shape)
+    coarse = Grid.covering(camera.width, camera.height, 2 * config.stride)
+    view_i, view_j = (
+        GridView(coarse, (camera.width, camera.height), intrinsics, coarse.sample(depth).astype(np.float64))
+        for depth in (depth_i, depth_j)
+    )
+    near = _predicted_motion(view_i, jTi) < config.far_motion * camera.width
     if isinstance(flow, OneWayFlow):
-        return measure_grid_seeded(flow, image_i, image_j, grid, grid, seed, seed_back)[0]
+        if near:
+            return measure_grid(flow, image_i, image_j, grid, grid)[0]
+        return measure_grid_predicted(flow, image_i, image_j, grid, grid, view_i, view_j, jTi)[0]
+    if near:
+        return sample_pair(flow.measure(image_i, image_j), grid, grid)[0]
+    seed = predicted_flow(depth_i, intrinsics, intrinsics, jTi, image_j.shape)
+    seed_back = predicted_flow(depth_j, intrinsics, intrinsics, invert_pose(jTi), image_i.shape)
     return sample_pair(flow.measure(image_i, image_j, seed, seed_back), grid, grid)[0]
+
+
+def _predicted_motion(view: GridView, jTi: Array) -> float:
+    """Median length of the flow to another frame of the camera, px; inf where nothing stays in view."""
+    points = transform_points(jTi, backproject(view.grid.pixels, view.depth, view.intrinsics))
+    pixels, depth = project(points, view.intrinsics)
+    with np.errstate(invalid="ignore"):
+        stays = (depth > 0.0) & ((pixels >= 0.0) & (pixels <= np.array(view.size) - 1)).all(axis=1)
+    length = np.linalg.norm((pixels - view.grid.pixels)[stays], axis=1)
+    return float(np.median(length)) if len(length) else np.inf
 
 
 def _sparse_depth(camera_map: CameraMap, frame: int, camera: Camera) -> Float32:

@@ -91,19 +91,18 @@ def measure_grid(
     )
 
 
-def measure_grid_seeded(
+def measure_grid_predicted(
     flow: OneWayFlow,
     grey_i: Image,
     grey_j: Image,
     grid_i: Grid,
     grid_j: Grid,
-    seed_i: Float32,
-    seed_j: Float32,
+    view_i: GridView,
+    view_j: GridView,
+    jTi: Array,
 ) -> tuple[GridFlow, GridFlow]:
-    """Flow on top of a predicted ``seed_i (H_i, W_i, 2)`` and ``seed_j (H_j, W_j, 2)`` px, NaN = unknown."""
-    level = flow.config.finest_scale
-    forward = _seeded(flow, grey_i, grey_j, _small_seed(seed_i, grey_j.shape, level))
-    backward = _seeded(flow, grey_j, grey_i, _small_seed(seed_j, grey_i.shape, level))
+    """Flow on top of what two views predict, whose grids may be others than ``grid_i`` and ``grid_j``."""
+    forward, backward = _predicted(flow, grey_i, grey_j, view_i, view_j, jTi)
     return (
         _sampled(forward, backward, grid_i, flow.config),
         _sampled(backward, forward, grid_j, flow.config),
@@ -120,9 +119,8 @@ def guide_grid(
     config: FlowConfig,
 ) -> tuple[GridFlow, GridFlow]:
     """``guided_flow`` at the grids of both views, whose depths and relative pose are known roughly."""
-    level, iTj = flow.config.finest_scale, invert_pose(jTi)
-    forward = _seeded(flow, grey_i, grey_j, predict_grid_flow(view_i, view_j, jTi, level))
-    backward = _seeded(flow, grey_j, grey_i, predict_grid_flow(view_j, view_i, iTj, level))
+    forward, backward = _predicted(flow, grey_i, grey_j, view_i, view_j, jTi)
+    iTj = invert_pose(jTi)
     results = []
     for one, other, view_a, view_b, bTa in (
         (forward, backward, view_i, view_j, jTi),
@@ -133,6 +131,16 @@ def guide_grid(
         weight *= _occlusion_weight(sampled.target, view_a, view_b, bTa, config)
         results.append(GridFlow(sampled.target, sampled.weight * weight))
     return results[0], results[1]
+
+
+def _predicted(
+    flow: OneWayFlow, grey_i: Image, grey_j: Image, view_i: GridView, view_j: GridView, jTi: Array
+) -> tuple[_OneWay, _OneWay]:
+    level = flow.config.finest_scale
+    return (
+        _seeded(flow, grey_i, grey_j, predict_grid_flow(view_i, view_j, jTi, level)),
+        _seeded(flow, grey_j, grey_i, predict_grid_flow(view_j, view_i, invert_pose(jTi), level)),
+    )
 
 
 def predict_grid_flow(view_i: GridView, view_j: GridView, jTi: Array, level: int) -> Float32:
@@ -188,19 +196,6 @@ def _halved(size: tuple[int, int], level: int) -> tuple[int, int]:
 def _to_small(positions: Array, small: int, whole: int) -> Array:
     """Along one axis, from pixels of ``whole`` of them to pixels of ``small``; centres are at integers."""
     return (positions + 0.5) * (small / whole) - 0.5
-
-
-def _small_seed(seed: Float32, shape_j: tuple[int, ...], level: int) -> Float32:
-    """A predicted flow ``(H_i, W_i, 2)`` px, NaN = unknown, as that of images halved ``level`` times."""
-    small = _shrunk(np.nan_to_num(seed, nan=float(NOWHERE)), level)
-    (height_i, width_i), (height, width) = seed.shape[:2], small.shape[:2]
-    width_j, height_j = _halved((shape_j[1], shape_j[0]), level)
-    x, y = width_j / shape_j[1], height_j / shape_j[0]
-    small = small * np.array([x, y], np.float32)
-    # what images of different size add
-    small[..., 0] += ((np.arange(width) + 0.5) * (x * width_i / width - 1.0)).astype(np.float32)
-    small[..., 1] += ((np.arange(height) + 0.5) * (y * height_i / height - 1.0)).astype(np.float32)[:, None]
-    return small
 
 
 def _seeded(flow: OneWayFlow, grey_i: Image, grey_j: Image, seed: Float32) -> _OneWay:
