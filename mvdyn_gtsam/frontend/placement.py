@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.features import match_features
 from mvdyn_gtsam.frontend.single_camera import CameraMap
+from mvdyn_gtsam.frontend.threads import in_order
 from mvdyn_gtsam.geometry import Similarity, invert_pose, rotation_angle_deg
 
 Array = npt.NDArray[np.float64]
@@ -264,17 +266,24 @@ def _search(
     indices = np.flatnonzero(usable)
     chance = np.minimum(matches.votes[indices], 10.0)
     chance /= chance.sum()
-    best: list[Hypothesis] = []
-    for _ in range(max(1, config.samples // 2000)):
-        sample = indices[random.choice(len(indices), size=(2000, 3), p=chance)]
+
+    def best_of(sample: Index) -> list[Hypothesis]:
         scale, rotation, translation = _fit_three(matches.point_a[sample], matches.point_b[sample])
         finite = np.flatnonzero(scale > 0.0)
         scale, rotation, translation = scale[finite], rotation[finite], translation[finite]
         counts = _count_inliers(scale, rotation, translation, scorer)
         rows = np.argsort(-counts)[:25]
-        best += scorer.hypotheses(
+        return scorer.hypotheses(
             [Similarity(float(scale[row]), rotation[row], translation[row]) for row in rows]
         )
+
+    # drawn here, in order: only what follows is done side by side
+    samples = (
+        indices[random.choice(len(indices), size=(2000, 3), p=chance)]
+        for _ in range(max(1, config.samples // 2000))
+    )
+    found = in_order(partial(best_of, sample) for sample in samples)
+    best = [hypothesis for batch in found for hypothesis in batch]
     best.sort(key=lambda hypothesis: -hypothesis.support)
     return best
 

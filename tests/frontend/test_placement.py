@@ -126,13 +126,17 @@ def test_a_repeated_texture_that_outvotes_the_truth_does_not_outrank_it() -> Non
     assert repeated[0].support < found[0].support
 
 
-def test_hypotheses_are_distinct_sorted_few_and_repeat_exactly() -> None:
+def test_hypotheses_are_distinct_sorted_few_and_repeat_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(2)
     map_a, map_b = two_maps(cloud(400))
     rows = np.column_stack([random.choice(visible(map_a), 150), random.choice(visible(map_b), 150)])
     matches = matches_between(map_a, map_b, rows)
     config = replace(CONFIG, samples=4000, hypotheses=5)
-    found, again = (propose_placements(matches, K, K, config) for _ in range(2))
+    runs = []
+    for threads in ("1", "4"):  # one after the other, and side by side
+        monkeypatch.setenv("OMP_NUM_THREADS", threads)
+        runs.append(propose_placements(matches, K, K, config))
+    found, again = runs
     assert 1 <= len(found) <= 5
     assert [h.support for h in found] == sorted((h.support for h in found), reverse=True)
     assert not any(same_placement(a.aSb, b.aSb) for a in found for b in found if a is not b)
