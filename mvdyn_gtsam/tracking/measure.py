@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +43,14 @@ class _Job:
     run: Callable[[], GridFlows]
 
 
+@dataclass(frozen=True)
+class _Running:
+    """A job begun, and what waits for its result."""
+
+    job: _Job
+    result: Callable[[], GridFlows]
+
+
 class EdgeMeasurer:
     """Measures connections between frames whose images the store can deliver.
 
@@ -73,33 +82,55 @@ class EdgeMeasurer:
 
     def temporal_all(self, pairs: Iterable[tuple[Keyframe, Keyframe]]) -> None:
         """``temporal`` for each pair, side by side; no pair may appear twice."""
-        self._measure(
-            self._guided_job(i, j)
-            if self.predicted_length(i, j) > self._config.guided_px
-            else self._plain_job(i, j)
-            for i, j in pairs
-        )
+        self.measure_all(pairs, ())
 
     def guided_all(self, pairs: Iterable[tuple[Keyframe, Keyframe]]) -> None:
         """``guided`` for each pair, side by side; no pair may appear twice."""
-        self._measure(self._guided_job(i, j) for i, j in pairs)
+        self.measure_all((), pairs)
 
-    def _measure(self, jobs: Iterator[_Job]) -> None:
-        """Run the jobs and store what they find, in their order; few at a time, for they hold images."""
-        if self._pool is None:
-            for job in jobs:
-                self._store(job, job.run())
-            return
-        running: deque[tuple[_Job, Future[GridFlows]]] = deque()
+    def measure_all(
+        self,
+        temporal: Iterable[tuple[Keyframe, Keyframe]],
+        guided: Iterable[tuple[Keyframe, Keyframe]],
+    ) -> None:
+        """``temporal`` and ``guided`` for each of their pairs; those are asked for while others are measured.
+
+        What is found is stored in their order, few at a time, for jobs hold images.
+        """
+        running: deque[_Running] = deque()
+        jobs = chain(
+            (self._temporal_job(i, j) for i, j in temporal), (self._guided_job(i, j) for i, j in guided)
+        )
         for job in jobs:
-            running.append((job, self._pool.submit(job.run)))
+            running.append(self._begin(job))
             if len(running) > 2 * self._workers:
-                done, future = running.popleft()
-                self._store(done, future.result())
-        for done, future in running:
-            self._store(done, future.result())
+                self._store(running.popleft())
+        for one in running:
+            self._store(one)
 
-    def _store(self, job: _Job, flows: GridFlows) -> None:
+    def begin_temporal(self, pairs: Iterable[tuple[Keyframe, Keyframe]]) -> Callable[[], None]:
+        """Begin ``temporal`` for few pairs at their present depths and poses; what is returned waits for the
+        flow and stores it."""
+        running = [self._begin(self._temporal_job(i, j)) for i, j in pairs]
+
+        def store() -> None:
+            for one in running:
+                self._store(one)
+
+        return store
+
+    def _temporal_job(self, i: Keyframe, j: Keyframe) -> _Job:
+        long = self.predicted_length(i, j) > self._config.guided_px
+        return self._guided_job(i, j) if long else self._plain_job(i, j)
+
+    def _begin(self, job: _Job) -> _Running:
+        if self._pool is not None:
+            return _Running(job, self._pool.submit(job.run).result)
+        flows = job.run()
+        return _Running(job, lambda: flows)
+
+    def _store(self, running: _Running) -> None:
+        job, flows = running.job, running.result()
         i, j = job.i, job.j
         i.flows[j.frame], j.flows[i.frame] = self._kept(flows[0], j), self._kept(flows[1], i)
         if job.guides is None:

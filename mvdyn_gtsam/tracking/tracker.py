@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from time import perf_counter
 
 import numpy as np
@@ -48,14 +48,23 @@ class Tracker:
         """Raises TrackingError where the start does not fit the cameras."""
         self.state = TrackState(cameras, start, flow, config, read)
         self._window = SlidingWindow(self.state.views, config.tracking, self.state.priors)
+        self._ahead: tuple[list[tuple[Keyframe, Keyframe]], Callable[[], None]] | None = None
 
-    def step(self, time: int, frames: Sequence[Image]) -> StepReport:
+    def step(self, time: int, frames: Sequence[Image], upcoming: Sequence[Image] | None = None) -> StepReport:
         """Take the frames ``(H, W, 3) uint8`` of all cameras at ``time``, the next instant.
 
-        Raises TrackingError for an instant out of order or a missing or wrongly sized frame.
+        Those of the instant after it may be handed in, too, as ``upcoming``: their flow is measured while
+        this one is solved. Raises TrackingError for an instant out of order or a missing or wrongly sized
+        frame.
         """
         began = perf_counter()
-        self._check_step(time, frames)
+        if time != self.state.last_time + 1:
+            raise TrackingError(
+                f"instant {time} was handed in after {self.state.last_time}; hand in every one in order"
+            )
+        self._check_frames(time, frames)
+        if upcoming is not None:
+            self._check_frames(time + 1, upcoming)
         self.state.last_time = time
         new: list[Keyframe] = []
         touched: dict[Frame, Keyframe] = {}
@@ -67,7 +76,8 @@ class Tracker:
             else:
                 self.state.others[candidate.camera].append(candidate)
         self._promote(new, touched)
-        self.state.count_time("temporal", began)
+        self.state.count_time("flow", began)
+        self._look_ahead(time + 1, upcoming)
         self._solve_step(new, touched)
         counts = self.state.graph.record(time)
         return StepReport(
@@ -86,16 +96,15 @@ class Tracker:
         followed: list[tuple[Keyframe, Keyframe, list[Array]]] = []
         for camera, track in enumerate(self.state.tracks):
             predictions = self._predictions(camera, time)
-            if track:
-                # the depth is only a stand-in until flow says better
-                frame = self._keyframe(camera, time, predictions[0], track[-1].log_depth)
-                followed.append((track[-1], frame, predictions))
-            else:
+            if not track:
                 sparse = self._nearest_start(camera, time)
                 log_depth = sparse_log_depth(sparse.pixels, sparse.depth, self.state.views[camera].grid)
-                frame = self._keyframe(camera, time, predictions[0], log_depth)
-            new.append(frame)
-        self.state.measurer.temporal_all([(last, frame) for last, frame, _ in followed])
+                new.append(self._keyframe(camera, time, predictions[0], log_depth))
+                continue
+            # the depth is only a stand-in until flow says better
+            new.append(self._keyframe(camera, time, predictions[0], track[-1].log_depth))
+            followed.append((track[-1], new[-1], predictions))
+        self._measure_followed([(last, frame) for last, frame, _ in followed])
         # where the flow is guided, the depth must belong to the new view: measured with that once more where
         # that predicts another flow
         guided = [one for one in followed if one[1].frame in one[0].guides]
@@ -110,6 +119,29 @@ class Tracker:
         for last, frame, _ in followed:
             self.state.carry_depth(frame, last)
         return new
+
+    def _look_ahead(self, time: int, images: Sequence[Image] | None) -> None:
+        """Begin to measure the frames of the next instant against the last keyframes, from where those are
+        before the window is solved: it moves them by little."""
+        if images is None:
+            return
+        pairs = []
+        for camera, (image, track) in enumerate(zip(images, self.state.tracks, strict=True)):
+            self.state.images.put((camera, time), image)
+            wTc = self._predictions(camera, time)[0]
+            pairs.append((track[-1], self._keyframe(camera, time, wTc, track[-1].log_depth)))
+        self._ahead = (pairs, self.state.measurer.begin_temporal(pairs))
+
+    def _measure_followed(self, pairs: Sequence[tuple[Keyframe, Keyframe]]) -> None:
+        """Flow from the last keyframes to new frames, begun in the step before where it could be."""
+        if self._ahead is None:
+            self.state.measurer.temporal_all(pairs)
+            return
+        (begun, store), self._ahead = self._ahead, None
+        store()
+        for (_, frame), (_, early) in zip(pairs, begun, strict=True):
+            frame.flows.update(early.flows)
+            frame.guides.update(early.guides)
 
     def _keyframe(self, camera: int, time: int, wTc: Array, log_depth: Array) -> Keyframe:
         sigma = np.full(len(log_depth), self.state.tracking.carried_sigma)
@@ -153,7 +185,7 @@ class Tracker:
     # ---- keyframes and their connections ---------------------------------------------------------------
 
     def _promote(self, new: Sequence[Keyframe], touched: dict[Frame, Keyframe]) -> None:
-        """Make frames of different cameras keyframes: temporal connections, measured."""
+        """Make frames of different cameras keyframes, connected and measured."""
         edges: list[Edge] = []
         unmeasured: list[tuple[Keyframe, Keyframe]] = []
         for frame in new:
@@ -171,11 +203,11 @@ class Tracker:
                 # a renewal takes in all flow since the last: early for depth, late for completeness
                 if offset in (offsets[0], self.state.graph_config.temporal_offsets[-1]):
                     touched[other.frame] = other
-        self.state.measurer.temporal_all(unmeasured)
         for frame in new:
             self.state.tracks[frame.camera].append(frame)
             self.state.frames[frame.frame] = frame
         self.state.add_edges(edges)
+        self.state.measurer.measure_all(unmeasured, self._connect_cameras(new))
 
     def _out_of_sight(self, other: Keyframe, frame: Keyframe, offset: int) -> bool:
         """Whether a fast camera has turned so far since ``other`` that flow would find next to nothing."""
@@ -192,20 +224,18 @@ class Tracker:
             for other in [key for key in last.flows if key not in self.state.frames and key != frame.frame]:
                 del last.flows[other]
 
-    def _connect_cameras(self, new: Sequence[Keyframe]) -> None:
+    def _connect_cameras(self, new: Sequence[Keyframe]) -> Iterator[tuple[Keyframe, Keyframe]]:
+        """Connect keyframes to those of other cameras; what is yielded is to be measured."""
         unmeasured: list[tuple[Keyframe, Keyframe]] = []
         for frame in new:
             edges = self.state.edges_to_other_cameras(frame, self.state.graph_config.st_per_frame)
             unmeasured += [(frame, self.state.frames[edge.j]) for edge in edges]
             self.state.add_edges(edges)
-        self.state.measurer.guided_all(unmeasured)
+        yield from unmeasured
 
     def _solve_step(self, new: list[Keyframe], touched: dict[Frame, Keyframe]) -> None:
         if not new:
             return
-        began = perf_counter()
-        self._connect_cameras(new)
-        self.state.count_time("inter-camera", began)
         began = perf_counter()
         self._window.update(new, list(touched.values()), self.state.frames)
         window = self.state.tracking.window
@@ -238,11 +268,7 @@ class Tracker:
         self._promote(new, touched)
         self._solve_step(new, touched)
 
-    def _check_step(self, time: int, frames: Sequence[Image]) -> None:
-        if time != self.state.last_time + 1:
-            raise TrackingError(
-                f"instant {time} was handed in after {self.state.last_time}; hand in every one in order"
-            )
+    def _check_frames(self, time: int, frames: Sequence[Image]) -> None:
         if len(frames) != len(self.state.views):
             raise TrackingError(f"instant {time}: {len(frames)} frames for {len(self.state.views)} cameras")
         for view, image in zip(self.state.views, frames, strict=True):
