@@ -112,11 +112,8 @@ def _track(
     cameras = range(len(capture.cameras))
     wTc = np.full((len(capture.cameras), capture.frame_count, 4, 4), np.nan)
     try:
-        upcoming = [capture.read(camera, 0) for camera in cameras]
         for time in range(capture.frame_count):
-            frames, last = upcoming, time + 1 == capture.frame_count
-            upcoming = [] if last else [capture.read(camera, time + 1) for camera in cameras]
-            report = tracker.step(time, frames, None if last else upcoming)
+            report = tracker.step(time, [capture.read(camera, time) for camera in cameras])
             wTc[:, time] = report.wTc
             note = f"{sum(report.keyframes)} new keyframes"
             progress.update("tracking", time + 1, capture.frame_count, note)

@@ -108,17 +108,6 @@ class EdgeMeasurer:
         for one in running:
             self._store(one)
 
-    def begin_temporal(self, pairs: Iterable[tuple[Keyframe, Keyframe]]) -> Callable[[], None]:
-        """Begin ``temporal`` for few pairs at their present depths and poses; what is returned waits for the
-        flow and stores it."""
-        running = [self._begin(self._temporal_job(i, j)) for i, j in pairs]
-
-        def store() -> None:
-            for one in running:
-                self._store(one)
-
-        return store
-
     def _temporal_job(self, i: Keyframe, j: Keyframe) -> _Job:
         long = self.predicted_length(i, j) > self._config.guided_px
         return self._guided_job(i, j) if long else self._plain_job(i, j)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from time import perf_counter
 
 import numpy as np
@@ -48,23 +48,14 @@ class Tracker:
         """Raises TrackingError where the start does not fit the cameras."""
         self.state = TrackState(cameras, start, flow, config, read)
         self._window = SlidingWindow(self.state.views, config.tracking, self.state.priors)
-        self._ahead: tuple[list[tuple[Keyframe, Keyframe]], Callable[[], None]] | None = None
 
-    def step(self, time: int, frames: Sequence[Image], upcoming: Sequence[Image] | None = None) -> StepReport:
+    def step(self, time: int, frames: Sequence[Image]) -> StepReport:
         """Take the frames ``(H, W, 3) uint8`` of all cameras at ``time``, the next instant.
 
-        Those of the instant after it may be handed in, too, as ``upcoming``: their flow is measured while
-        this one is solved. Raises TrackingError for an instant out of order or a missing or wrongly sized
-        frame.
+        Raises TrackingError for an instant out of order or a missing or wrongly sized frame.
         """
         began = perf_counter()
-        if time != self.state.last_time + 1:
-            raise TrackingError(
-                f"instant {time} was handed in after {self.state.last_time}; hand in every one in order"
-            )
-        self._check_frames(time, frames)
-        if upcoming is not None:
-            self._check_frames(time + 1, upcoming)
+        self._check_step(time, frames)
         self.state.last_time = time
         new: list[Keyframe] = []
         touched: dict[Frame, Keyframe] = {}
@@ -77,7 +68,6 @@ class Tracker:
                 self.state.others[candidate.camera].append(candidate)
         self._promote(new, touched)
         self.state.count_time("flow", began)
-        self._look_ahead(time + 1, upcoming)
         self._solve_step(new, touched)
         counts = self.state.graph.record(time)
         return StepReport(
@@ -104,7 +94,7 @@ class Tracker:
             # the depth is only a stand-in until flow says better
             new.append(self._keyframe(camera, time, predictions[0], track[-1].log_depth))
             followed.append((track[-1], new[-1], predictions))
-        self._measure_followed([(last, frame) for last, frame, _ in followed])
+        self.state.measurer.temporal_all([(last, frame) for last, frame, _ in followed])
         # where the flow is guided, the depth must belong to the new view: measured with that once more where
         # that predicts another flow
         guided = [one for one in followed if one[1].frame in one[0].guides]
@@ -119,29 +109,6 @@ class Tracker:
         for last, frame, _ in followed:
             self.state.carry_depth(frame, last)
         return new
-
-    def _look_ahead(self, time: int, images: Sequence[Image] | None) -> None:
-        """Begin to measure the frames of the next instant against the last keyframes, from where those are
-        before the window is solved: it moves them by little."""
-        if images is None:
-            return
-        pairs = []
-        for camera, (image, track) in enumerate(zip(images, self.state.tracks, strict=True)):
-            self.state.images.put((camera, time), image)
-            wTc = self._predictions(camera, time)[0]
-            pairs.append((track[-1], self._keyframe(camera, time, wTc, track[-1].log_depth)))
-        self._ahead = (pairs, self.state.measurer.begin_temporal(pairs))
-
-    def _measure_followed(self, pairs: Sequence[tuple[Keyframe, Keyframe]]) -> None:
-        """Flow from the last keyframes to new frames, begun in the step before where it could be."""
-        if self._ahead is None:
-            self.state.measurer.temporal_all(pairs)
-            return
-        (begun, store), self._ahead = self._ahead, None
-        store()
-        for (_, frame), (_, early) in zip(pairs, begun, strict=True):
-            frame.flows.update(early.flows)
-            frame.guides.update(early.guides)
 
     def _keyframe(self, camera: int, time: int, wTc: Array, log_depth: Array) -> Keyframe:
         sigma = np.full(len(log_depth), self.state.tracking.carried_sigma)
@@ -268,7 +235,11 @@ class Tracker:
         self._promote(new, touched)
         self._solve_step(new, touched)
 
-    def _check_frames(self, time: int, frames: Sequence[Image]) -> None:
+    def _check_step(self, time: int, frames: Sequence[Image]) -> None:
+        if time != self.state.last_time + 1:
+            raise TrackingError(
+                f"instant {time} was handed in after {self.state.last_time}; hand in every one in order"
+            )
         if len(frames) != len(self.state.views):
             raise TrackingError(f"instant {time}: {len(frames)} frames for {len(self.state.views)} cameras")
         for view, image in zip(self.state.views, frames, strict=True):
