@@ -68,5 +68,9 @@ class Context:
 
     def trust(self, frame: Frame) -> Float32:
         """``(h, w)`` in [0, 1], how far the flow settles the depth solved last."""
-        information = self.image("information", frame)
-        return information / (information + np.float32(TRUSTED_SIGMA**-2))
+        return trust_of(self.image("information", frame))
+
+
+def trust_of(information: Float32) -> Float32:
+    """In [0, 1] how far a depth of that ``information`` (inverse variance of its log) is believed."""
+    return information / (information + np.float32(TRUSTED_SIGMA**-2))

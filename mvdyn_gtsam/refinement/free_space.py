@@ -56,15 +56,35 @@ class DepthView:
     """``(4, 4)``"""
 
 
-def seen_through(theta: Float32, rays: Float32, views: Sequence[DepthView]) -> Mask:
-    """Which points at log inverse depth ``theta (M,)`` along ``rays (M, 3)`` are seen through, ``(M,)``."""
-    through, seen = (np.zeros(len(theta), np.int32) for _ in range(2))
+@dataclass(frozen=True)
+class Sight:
+    """How many views see a surface behind points, and how many see the points."""
+
+    through: npt.NDArray[np.int32]
+    """``(M,)``"""
+    there: npt.NDArray[np.int32]
+    """``(M,)``"""
+
+    @property
+    def seen_through(self) -> Mask:
+        """``(M,)`` no surface is there."""
+        return (self.through >= WITNESSES) & (self.through >= 2 * self.there)
+
+    @property
+    def seen_there(self) -> Mask:
+        """``(M,)`` a surface is there, at other times or for other cameras, too."""
+        return (self.there >= WITNESSES) & (self.there >= 2 * self.through)
+
+
+def sight(theta: Float32, rays: Float32, views: Sequence[DepthView]) -> Sight:
+    """What views see of points at log inverse depth ``theta (M,)`` along ``rays (M, 3)``."""
+    through, there = (np.zeros(len(theta), np.int32) for _ in range(2))
     for view in views:
         farther, (row, column) = depth_beyond(theta, rays, view)
         told = view.trust[row, column] > TRUSTED
         through += told & (farther > BEHIND)
-        seen += told & (np.abs(farther) < AGREES)
-    return (through >= WITNESSES) & (through >= 2 * seen)
+        there += told & (np.abs(farther) < AGREES)
+    return Sight(through, there)
 
 
 def without_outlines(mask: Mask) -> Mask:

@@ -102,13 +102,47 @@ def moving_regions(
     that the ``edges`` lead to. The pixels and those that the flow finds there vote: what moves evenly along
     its epipolar lines for a moment passes for static in one frame, and noise for motion, but not in most.
     """
-    votes, count = own.astype(np.float32).ravel(), np.ones(own.size, np.float32)
+    votes, count = _votes(own.size, edges, there)
+    moves = votes + own.ravel() >= config.moving_share * (count + 1.0)
+    return _whole_regions(moves.reshape(own.shape), config)
+
+
+def carried_regions(
+    own: npt.NDArray[np.uint8],
+    edges: Sequence[Edge],
+    there: Sequence[npt.NDArray[np.uint8]],
+    stands: npt.NDArray[np.uint8],
+    config: RefinementConfig,
+) -> npt.NDArray[np.uint8]:
+    """Where the static model fails in a frame ``(h, w)``, with what moves in those before or after.
+
+    As in ``moving_regions``; here nearly all of one side must agree, so that what is found is carried to the
+    ends of a video, over pauses, and through moments of even motion; but not where others see a surface that
+    ``stands (h, w)`` there.
+    """
+    carried = np.zeros(own.size, bool)
+    for past in (True, False):
+        side = [k for k, edge in enumerate(edges) if (edge.j[1] < edge.i[1]) == past]
+        votes, count = _votes(own.size, [edges[k] for k in side], [there[k] for k in side])
+        carried |= (count > 0.0) & (votes >= config.carried_share * count)
+    found = _whole_regions(carried.reshape(own.shape) & (stands == 0), config)
+    return np.maximum(own, (found > 0).astype(np.uint8))
+
+
+def _votes(
+    pixels: int, edges: Sequence[Edge], there: Sequence[npt.NDArray[np.uint8]]
+) -> tuple[Float32, Float32]:
+    """How many of the frames that ``edges`` lead to call each pixel failing, and how many see it."""
+    votes, count = (np.zeros(pixels, np.float32) for _ in range(2))
     for edge, fails in zip(edges, there, strict=True):
         seen = (edge.nearest >= 0) & (edge.weight >= SURE_WEIGHT)
         votes[edge.pixels[seen]] += fails.ravel()[edge.nearest[seen]]
         count[edge.pixels[seen]] += 1.0
-    moves = (votes >= config.moving_share * count).astype(np.uint8).reshape(own.shape)
-    return regions(closed(cv2.medianBlur(moves, 5), config), config)
+    return votes, count
+
+
+def _whole_regions(mask: Mask, config: RefinementConfig) -> npt.NDArray[np.int32]:
+    return regions(closed(cv2.medianBlur(mask.astype(np.uint8), 5), config), config)
 
 
 def closed(mask: npt.NDArray[np.uint8], config: RefinementConfig) -> npt.NDArray[np.uint8]:

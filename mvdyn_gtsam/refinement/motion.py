@@ -1,13 +1,14 @@
 """What moves in a frame, and where phase 2 begins with it.
 
-Five steps, since a frame asks others: ``free_space_task`` adds what other views see through to where the
-static model fails; ``settle_task`` finds what moves and its outline; ``observe_task`` asks the cameras of the
-instant for the depth of each region; ``smooth_over_time`` makes that one over time; ``moving_depth_task``
-writes it.
+Six steps, since a frame asks others: ``free_space_task`` adds what other views see through to where the
+static model fails; ``carry_task`` what moves before and after; ``settle_task`` finds what moves and its
+outline; ``observe_task`` asks the cameras of the instant for the depth of each region; ``smooth_over_time``
+makes that one over time; ``moving_depth_task`` writes it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -19,8 +20,9 @@ from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
-from mvdyn_gtsam.refinement.free_space import BEHIND, DepthView, seen_through, without_outlines
-from mvdyn_gtsam.refinement.initial import closed, moving_regions, regions, static_residual
+from mvdyn_gtsam.refinement.edges import Edge
+from mvdyn_gtsam.refinement.free_space import BEHIND, DepthView, sight, without_outlines
+from mvdyn_gtsam.refinement.initial import carried_regions, closed, moving_regions, regions, static_residual
 from mvdyn_gtsam.refinement.moving_depth import (
     InstantView,
     RegionDepth,
@@ -31,8 +33,6 @@ from mvdyn_gtsam.refinement.moving_depth import (
     smooth_over_time,
 )
 from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
-from mvdyn_gtsam.refinement.patches import Picture
-from mvdyn_gtsam.refinement.static_regions import StaticRegions, static_regions
 
 Mask = npt.NDArray[np.bool_]
 Labels = npt.NDArray[np.int32]
@@ -74,37 +74,22 @@ class KnownDepth:
     another camera sees it stand still; else ``UNEXPLAINED``."""
 
 
-def static_among(context: Context, frame: Frame, fails: npt.NDArray[np.uint8]) -> StaticRegions:
-    """Of the regions of a frame where flow ``fails (h, w)`` those that other times of the camera know."""
-    workspace, wTc, (camera, time) = context.workspace, context.poses(), frame
-    view = workspace.views[camera]
-    times = [time + sign * offset for offset in context.config.match_offsets for sign in (-1, 1)]
-    others = [
-        Picture(context.luminance((camera, t)), view.intrinsics, invert_pose(wTc[camera, t]) @ wTc[frame])
-        for t in times
-        if 0 <= t < workspace.frame_count
-    ]
-    return static_regions(
-        regions(fails, context.config),
-        context.luminance(frame),
-        context.image("swept", frame),
-        view.rays,
-        others,
-        context.config.match_likeness,
-    )
-
-
 def free_space_task(context: Context, frame: Frame) -> None:
-    """Add to where the static model fails in a frame what other times and cameras see through."""
+    """Add to where the static model fails in a frame what other times and cameras see through.
+
+    Keeps where they see the surface itself, too.
+    """
     workspace, config, view = context.workspace, context.config, context.workspace.views[frame[0]]
     views = _witnesses(context, frame)
     theta = context.image("first", frame)
     every = (slice(FREE_SPACE_RASTER // 2, None, FREE_SPACE_RASTER),) * 2
     rays = view.rays.reshape(*view.shape, 3)[every]
-    through = seen_through(theta[every].ravel(), rays.reshape(-1, 3), views).reshape(rays.shape[:2])
-    marked, settled = (
+    seen = sight(theta[every].ravel(), rays.reshape(-1, 3), views)
+    through, there = (mask.reshape(rays.shape[:2]) for mask in (seen.seen_through, seen.seen_there))
+    trusted = through & (context.trust(frame)[every] > SETTLED)
+    marked, settled, stands = (
         cv2.resize(mask.astype(np.uint8), view.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        for mask in (without_outlines(through), through & (context.trust(frame)[every] > SETTLED))
+        for mask in (without_outlines(through), trusted, there)
     )
     found = regions(closed(marked, config), config)
     for label in range(1, int(found.max()) + 1):
@@ -113,6 +98,7 @@ def free_space_task(context: Context, frame: Frame) -> None:
         if settled[region].mean() < SETTLED_SHARE:
             found[found == label] = 0
     workspace.write("fails", frame, np.maximum(np.asarray(workspace.read("fails", frame)), found > 0))
+    workspace.write("stands", frame, stands)
 
 
 def _witnesses(context: Context, frame: Frame) -> list[DepthView]:
@@ -138,12 +124,28 @@ def _witnesses(context: Context, frame: Frame) -> list[DepthView]:
     ]
 
 
+def carry_task(context: Context, job: tuple[str, str, Frame]) -> None:
+    """Carry what moves before and after into a frame: ``(read from, write to, frame)``, arrays."""
+    source, target, frame = job
+    workspace = context.workspace
+    edges = _near(context, context.edges(frame, context.poses(), own_camera=True))
+    there = [np.asarray(workspace.read(source, edge.j)) for edge in edges]
+    own, stands = (np.asarray(workspace.read(name, frame)) for name in (source, "stands"))
+    workspace.write(target, frame, carried_regions(own, edges, there, stands, context.config))
+
+
+def _near(context: Context, edges: Sequence[Edge]) -> list[Edge]:
+    """Of the edges within a camera those that flow was measured for densely."""
+    reach = max(context.config.temporal_offsets, default=0)
+    return [edge for edge in edges if abs(edge.j[1] - edge.i[1]) <= reach]
+
+
 def settle_task(context: Context, frame: Frame) -> None:
     """What moves in a frame, by the vote of the frames around it, and the depth of what stands still."""
     workspace, config = context.workspace, context.config
     edges = context.edges(frame, context.poses(), own_camera=True)
     theta = context.image("first", frame)
-    near = [edge for edge in edges if abs(edge.j[1] - frame[1]) <= max(config.temporal_offsets, default=0)]
+    near = _near(context, edges)
     votes = [np.asarray(workspace.read("fails", edge.j)) for edge in near]
     labels = moving_regions(np.asarray(workspace.read("fails", frame)), near, votes, config)
     # flow that a static depth explains is the best evidence against motion

@@ -31,6 +31,8 @@ TOLERANCE = 0.15
 """Pixels of a region whose own depth is within this (relative) of the region's keep it."""
 BIN = 0.1
 """Of the histogram of log depth that finds the commonest."""
+PATCH = 9
+"""Side of the patches compared, px of the view."""
 NO_SUPPORT, FULL_SUPPORT = 0.08, 0.2
 """Correlation at which a depth counts nothing and fully. Source: wrong depths of regions of dynamic_human had
 0.07 to 0.13, right ones 0.15 to 0.3."""
@@ -226,7 +228,7 @@ def support(
     """
     best, inverse_depth = 0.0, np.full(len(rays), np.exp(log_inverse_depth), np.float32)
     for view in views:
-        alike, inside = likeness(grey, inverse_depth, rays, view)
+        alike, inside = likeness(grey, inverse_depth, rays, view, PATCH)
         seen = inside & region
         best = max(best, float(alike[seen].sum() / np.count_nonzero(region)))
     return float(np.clip((best - NO_SUPPORT) / (FULL_SUPPORT - NO_SUPPORT), 0.0, 1.0))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from types import TracebackType
@@ -40,6 +41,11 @@ BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
 BYTES_PER_PIXEL = 50.0
 """Of a view on disk besides its flow: twelve arrays of 32 bits and two of 8."""
+FAILS, CARRIED = "fails", "carried"
+"""The arrays of where the static model fails that ``carry`` reads and writes in turn."""
+CARRY_ROUNDS = 4
+"""An even number, so that the last writes ``FAILS``. Each reaches as far as the flow. Source: 1 to 5 compared
+on five rendered scenes."""
 SECONDS_PER_MEGAPIXEL = 0.37
 """One flow pair on one processor, per million pixels of the input. Source: robodog_overlap and HoloLens in
 experiments/results/refinement_phases.json."""
@@ -142,6 +148,9 @@ class Refinement:
         if config.phase2:
             self._step("begin", lambda: self._map("begin", self._frames))
             self._step("free space", lambda: self._map("free space", self._frames))
+            for number in range(1, CARRY_ROUNDS + 1):
+                source, target = (FAILS, CARRIED) if number % 2 else (CARRIED, FAILS)
+                self._step(f"carry {number}", partial(self._carry, source, target))
             self._step("settle", self._settle)
             self._depth = "begun"
             self._solve_depth(FIRST_DEPTH, min(GUIDE_STEPS, config.depth_iterations))
@@ -183,7 +192,8 @@ class Refinement:
         workspace, tracked = self._workspace, self._tracked
         workspace.create("grey", np.uint8, full_size=True)
         workspace.create("moving", np.uint8)
-        workspace.create("fails", np.uint8)
+        for name in (FAILS, CARRIED, "stands"):
+            workspace.create(name, np.uint8)
         workspace.create(LABELS, np.uint8)
         for name in (
             "tracked", "tracked_confidence", "aligned", "swept", "instant", "prior", "prior_weight", "first",
@@ -206,6 +216,9 @@ class Refinement:
         workspace.write_array("tracked_poses", tracked.wTc)
         ones, zeros = np.ones(tracked.wTc.shape[:2]), np.zeros(tracked.wTc.shape[:2])
         workspace.write_array("scales", np.stack([ones, zeros]))
+
+    def _carry(self, source: str, target: str) -> None:
+        self._map("carry", [(source, target, frame) for frame in self._frames])
 
     def _settle(self) -> None:
         """What moves, and the depth that phase 2 begins with."""

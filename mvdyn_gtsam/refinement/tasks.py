@@ -16,7 +16,7 @@ import numpy.typing as npt
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import Pair
-from mvdyn_gtsam.refinement.context import MOVING, STATIC, TRUSTED_SIGMA, UNEXPLAINED, Context
+from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
 from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
 from mvdyn_gtsam.refinement.edges import Edge, load_edges
 from mvdyn_gtsam.refinement.initial import (
@@ -28,12 +28,13 @@ from mvdyn_gtsam.refinement.initial import (
 )
 from mvdyn_gtsam.refinement.measurement import measure_pair, sweep_frame
 from mvdyn_gtsam.refinement.motion import (
+    carry_task,
     free_space_task,
     moving_depth_task,
     observe_task,
     settle_task,
-    static_among,
 )
+from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
 from mvdyn_gtsam.refinement.planes import PlainRegion, fill_plain, plain_regions, planes_in_world
 from mvdyn_gtsam.refinement.samples import FrameSample
 
@@ -48,9 +49,6 @@ FIRST_STEPS = 2
 """Gauss-Newton steps before it is asked what moves."""
 GUIDE_STEPS = 2
 """Gauss-Newton steps of the depth that guides the flow between cameras; that flow improves it later."""
-
-MATCHED_INFORMATION = TRUSTED_SIGMA**-2
-"""On log depth of a pixel that stands still by its likeness alone. Source: choice, half as good as sure."""
 
 FIRST_DEPTH = "depth 0"
 """The array of the first depth solve, from flow within cameras; it guides the flow between them."""
@@ -100,14 +98,10 @@ def begin_task(context: Context, frame: Frame) -> None:
         np.log(chosen), FrameProblem(edges, {}, weights, weak, config), FIRST_STEPS
     )
     fails = failing_regions(static_residual(np.exp(theta), edges), config)
-    if fails.any():
-        found = static_among(context, frame, fails)
-        fails[found.still] = 0
-        theta[found.matched] = np.log(context.image("swept", frame))[found.matched]
-        information[found.matched] = np.where(found.seen, MATCHED_INFORMATION, 0.0)[found.matched]
-    workspace.write("first", frame, theta)
-    workspace.write("information", frame, information)
-    workspace.write("fails", frame, fails)
+    first = told_by_other_times(context, frame, FirstDepth(theta, information, fails))
+    workspace.write("first", frame, first.theta)
+    workspace.write("information", frame, first.information)
+    workspace.write("fails", frame, first.fails)
 
 
 def window_task(context: Context, window: tuple[str, str, int, int, int]) -> None:
@@ -324,6 +318,7 @@ TASKS = {
     "wide flow": wide_flow_task,
     "begin": begin_task,
     "free space": free_space_task,
+    "carry": carry_task,
     "settle": settle_task,
     "observe": observe_task,
     "moving depth": moving_depth_task,

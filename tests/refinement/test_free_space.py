@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvdyn_gtsam.capture.model import Camera
-from mvdyn_gtsam.refinement.free_space import DepthView, depth_beyond, seen_through, without_outlines
+from mvdyn_gtsam.refinement.free_space import DepthView, depth_beyond, sight, without_outlines
 from mvdyn_gtsam.refinement.views import DenseView
 
 SHAPE = (60, 80)
@@ -27,7 +27,18 @@ def seen(depth: float, x: float = 0.0, trust: np.ndarray = SURE) -> DepthView:
 def through(depth: float, views: list[DepthView]) -> float:
     """Share of the inner points at ``depth`` that are seen through."""
     theta = np.full(int(INNER.sum()), -np.log(depth), np.float32)
-    return float(seen_through(theta, VIEW.rays[INNER.ravel()], views).mean())
+    return float(sight(theta, VIEW.rays[INNER.ravel()], views).seen_through.mean())
+
+
+def test_a_surface_that_two_views_see_stands_there() -> None:
+    theta = np.full(len(VIEW.rays), -np.log(WALL), np.float32)
+    assert sight(theta, VIEW.rays, [seen(WALL), seen(WALL)]).seen_there.all()
+    assert not sight(theta, VIEW.rays, [seen(WALL)]).seen_there.any()
+    assert not sight(
+        theta, VIEW.rays, [seen(WALL), seen(WALL), seen(2 * WALL), seen(2 * WALL)]
+    ).seen_there.any()
+    # a thing before it hides it: that is no word against it, nor for it
+    assert not sight(theta, VIEW.rays, [seen(BOARD), seen(BOARD)]).seen_there.any()
 
 
 def test_what_two_views_see_the_wall_behind_is_not_there() -> None:

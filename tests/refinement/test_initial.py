@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
     _triangulated,
     best_candidate,
+    carried_regions,
     failing_regions,
     most_telling,
     moving_regions,
@@ -212,6 +214,45 @@ def test_what_flows_out_of_the_image_has_no_vote(own_edges: list[Edge]) -> None:
     gone = [replace(edge, nearest=np.full_like(edge.nearest, -1)) for edge in own_edges]
     votes = [np.ones(VIEW.shape, np.uint8)] * len(gone)
     assert (moving_regions(np.zeros(VIEW.shape, np.uint8), gone, votes, CONFIG) == 0).all()
+
+
+def carried(edges: list[Edge], block: Mask, seen_by: Callable[[Edge], bool], stands: Mask) -> Mask:
+    """Where the static model fails in a frame that saw nothing itself, of a block that some others saw."""
+    there = [(block & seen_by(edge)).astype(np.uint8) for edge in edges]
+    own = np.zeros(VIEW.shape, np.uint8)
+    return carried_regions(own, edges, there, stands.astype(np.uint8), CONFIG) > 0
+
+
+def test_what_all_frames_of_one_side_see_move_is_carried(own_edges: list[Edge]) -> None:
+    edges = [replace(edge, nearest=edge.pixels) for edge in own_edges]
+    block, nothing = square(20, 30, 16), np.zeros(VIEW.shape, bool)
+    assert {edge.j[1] < edge.i[1] for edge in edges} == {True, False}
+    for past in (True, False):
+        side = {edge.j for edge in edges if (edge.j[1] < edge.i[1]) == past}
+        found = carried(edges, block, lambda edge: edge.j in side, nothing)  # noqa: B023
+        assert found[block].mean() > 0.9 and found[~block].mean() < 0.02
+    assert not carried(edges, block, lambda _: False, nothing).any()
+
+
+def test_what_half_of_each_side_sees_is_not_carried(own_edges: list[Edge]) -> None:
+    edges = [replace(edge, nearest=edge.pixels) for edge in own_edges]
+    steps = sorted({abs(edge.j[1] - edge.i[1]) for edge in edges})
+    near = steps[: len(steps) // 2]
+    block, nothing = square(20, 30, 16), np.zeros(VIEW.shape, bool)
+    assert near
+    found = carried(edges, block, lambda edge: abs(edge.j[1] - edge.i[1]) in near, nothing)
+    assert not found.any()
+
+
+def test_what_others_see_stand_there_is_not_carried(own_edges: list[Edge]) -> None:
+    edges = [replace(edge, nearest=edge.pixels) for edge in own_edges]
+    block = square(20, 30, 16)
+    assert not carried(edges, block, lambda _: True, block).any()
+
+
+def test_what_a_frame_sees_itself_stays(own_edges: list[Edge]) -> None:
+    own, nothing = square(20, 30, 16).astype(np.uint8), np.zeros(VIEW.shape, np.uint8)
+    assert (carried_regions(own, own_edges, [nothing] * len(own_edges), nothing, CONFIG) == own).all()
 
 
 def test_two_blocks_are_two_regions_and_a_speck_is_none() -> None:

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from mvdyn_gtsam.capture.model import Camera
-from mvdyn_gtsam.refinement.patches import PATCH, Picture, contrast, likeness
+from mvdyn_gtsam.refinement.patches import Picture, contrast, likeness
 from mvdyn_gtsam.refinement.views import DenseView
 
 SHAPE = (60, 80)
 VIEW = DenseView.of(Camera("cam0", 80, 60, 70.0, 70.0, 39.5, 29.5), 1.0)
 WALL = 4.0
+PATCH = 9
 SHIFT = 8
 """Pixels by which the wall moves in the view at the side."""
 
@@ -37,24 +38,24 @@ def at(depth: float) -> np.ndarray:
 
 def test_patches_are_alike_at_the_true_depth_only() -> None:
     grey, side = wall_and_side()
-    alike, seen = likeness(grey, at(WALL), VIEW.rays, side)
+    alike, seen = likeness(grey, at(WALL), VIEW.rays, side, PATCH)
     assert seen[:, SHIFT:].all() and not seen[:, : SHIFT - 1].any()
     assert alike[:, SHIFT + PATCH :].min() > 0.99
-    wrong, there = likeness(grey, at(2.0 * WALL), VIEW.rays, side)
+    wrong, there = likeness(grey, at(2.0 * WALL), VIEW.rays, side, PATCH)
     assert np.median(wrong[there]) < 0.3
 
 
 def test_brightness_and_contrast_of_the_view_do_not_matter() -> None:
     grey, side = wall_and_side()
     darker = Picture(0.5 * side.grey + 20.0, side.intrinsics, side.jTi)
-    alike, _ = likeness(grey, at(WALL), VIEW.rays, darker)
+    alike, _ = likeness(grey, at(WALL), VIEW.rays, darker, PATCH)
     assert alike[:, SHIFT + PATCH :].min() > 0.95
 
 
 def test_without_texture_nothing_is_alike() -> None:
     _, side = wall_and_side()
     plain = np.full(SHAPE, 90.0, np.float32)
-    alike, _ = likeness(plain, at(WALL), VIEW.rays, Picture(plain, side.intrinsics, side.jTi))
+    alike, _ = likeness(plain, at(WALL), VIEW.rays, Picture(plain, side.intrinsics, side.jTi), PATCH)
     assert alike.max() < 1e-3
 
 
@@ -62,7 +63,7 @@ def test_nothing_is_seen_behind_the_view() -> None:
     grey, side = wall_and_side()
     ahead = side.jTi.copy()
     ahead[2, 3] = -2.0 * WALL
-    assert not likeness(grey, at(WALL), VIEW.rays, Picture(side.grey, side.intrinsics, ahead))[1].any()
+    assert not likeness(grey, at(WALL), VIEW.rays, Picture(side.grey, side.intrinsics, ahead), PATCH)[1].any()
 
 
 @pytest.mark.parametrize("make", [lambda x: x, lambda x: 0.3 * x + 50.0])
@@ -70,4 +71,4 @@ def test_contrast_is_the_deviation_of_the_patch(make: Callable[[np.ndarray], np.
     image = make(texture()).astype(np.float32)
     half = PATCH // 2
     patch = image[30 - half : 31 + half, 40 - half : 41 + half]
-    assert contrast(image)[30, 40] == pytest.approx(patch.std(), rel=1e-2)
+    assert contrast(image, PATCH)[30, 40] == pytest.approx(patch.std(), rel=1e-2)

@@ -1,0 +1,161 @@
+"""What images of other times say of a frame's first depth.
+
+Flow is smooth: around plain things it mixes what is before and behind, or makes something up, and no static
+depth explains it; of things that move fast it finds nothing. A static surface looks alike at other times, at
+the depth that the sweep found, whatever the flow says. What moves is alike at no static depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.geometry import invert_pose
+from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.context import TRUSTED_SIGMA, Context, trust_of
+from mvdyn_gtsam.refinement.initial import closed, known_median, regions
+from mvdyn_gtsam.refinement.patches import Picture, PictureView, contrast, likeness
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.views import DenseView
+
+Labels = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
+
+PATCH = 5
+"""Side of the patches compared, px of the swept size."""
+TEXTURE = 6.0
+"""Contrast of a patch, grey levels, from which it tells a depth from another. Source: choice, three times the
+noise."""
+TEXTURED_SHARE = 0.1
+"""Of a region below which it is bare: flow without texture is no evidence. Source: choice."""
+UNLIKE_SHARE = 0.5
+"""Of a region whose gaps were closed that must be unlike itself. Source: choice."""
+NO_TRUST = 0.2
+"""Trust in its depth below which a pixel may move: flow that a static depth explains is the better witness.
+Source: choice."""
+MATCHED_INFORMATION = TRUSTED_SIGMA**-2
+"""On log depth of a pixel that stands still by its likeness alone. Source: choice, half as good as sure."""
+
+
+@dataclass(frozen=True)
+class FirstDepth:
+    """Depth of a frame as if nothing moved, and where that fails."""
+
+    theta: Float32
+    """``(h, w)`` log inverse depth."""
+    information: Float32
+    """``(h, w)`` inverse variance of ``theta`` by the flow."""
+    fails: npt.NDArray[np.uint8]
+    """``(h, w)`` 1 where no static depth explains what is seen."""
+
+
+@dataclass(frozen=True)
+class StaticRegions:
+    """Pixels of regions that stand still."""
+
+    still: Mask
+    """``(h, w)`` of all such regions."""
+    matched: Mask
+    """``(h, w)`` of those which look alike at the swept depth; the others are bare."""
+
+
+def told_by_other_times(context: Context, frame: Frame, first: FirstDepth) -> FirstDepth:
+    """``first`` after the images of other times of the camera were asked.
+
+    Failing regions that look alike there at the swept depth take it and fail no more; nor do bare ones, of
+    which flow cannot tell that they move. What looks alike at neither depth, and has no flow, fails too.
+    """
+    config, size = context.config, first.theta.shape[::-1]
+    views = [DenseView.of(view.camera, config.sweep.scale) for view in context.workspace.views]
+    others = _other_times(context, frame, views[frame[0]])
+    if not others:
+        return first
+    view, grey = views[frame[0]], _grey(context, frame, views[frame[0]])
+    swept = context.image("swept", frame)
+    alike_swept, alike_first = (
+        median_likeness(grey, np.asarray(view.shrink(inverse_depth), np.float32), view.rays, others)
+        for inverse_depth in (swept, np.exp(first.theta))
+    )
+    textured = contrast(grey, PATCH) > TEXTURE
+    trust = np.asarray(view.shrink(trust_of(first.information)), np.float32)
+    alike = np.fmax(alike_swept, alike_first)
+    unlike = unlike_regions(alike, textured & (trust < NO_TRUST), config)
+    alike_swept = cv2.resize(alike_swept, size, interpolation=cv2.INTER_NEAREST)
+    textured, unlike = (
+        cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        for mask in (textured, unlike)
+    )
+    found = static_regions(regions(first.fails, config), alike_swept, textured, config.match_likeness)
+    sure = textured & (np.nan_to_num(alike_swept) > config.match_likeness)
+    information = np.where(sure, np.float32(MATCHED_INFORMATION), np.float32(0.0))
+    return FirstDepth(
+        np.where(found.matched, np.log(swept), first.theta),
+        np.where(found.matched, information, first.information),
+        (((first.fails > 0) & ~found.still) | unlike).astype(np.uint8),
+    )
+
+
+def static_regions(labels: Labels, alike: Float32, textured: Mask, least_likeness: float) -> StaticRegions:
+    """Which regions of ``labels (h, w)``, numbered from 1, stand still.
+
+    ``alike (h, w)`` is of ``median_likeness`` at the swept depth. A region stands still where most of its
+    ``textured (h, w)`` pixels that other times see are alike by ``least_likeness``, and where it has none.
+    """
+    telling = textured & np.isfinite(alike)
+    still, matched = (np.zeros(labels.shape, bool) for _ in range(2))
+    for label in range(1, int(labels.max(initial=0)) + 1):
+        region = labels == label
+        if textured[region].mean() < TEXTURED_SHARE:
+            still |= region
+        elif (region & telling).any() and np.median(alike[region & telling]) > least_likeness:
+            still |= region
+            matched |= region
+    return StaticRegions(still, matched)
+
+
+def unlike_regions(alike: Float32, telling: Mask, config: RefinementConfig) -> Mask:
+    """``(h, w)`` the regions that are nowhere alike: ``alike (h, w)`` at the best static depth, judged by the
+    pixels ``telling (h, w)``."""
+    unlike = telling & (np.nan_to_num(alike, nan=1.0) < config.unlike_likeness)
+    unlike = cv2.medianBlur(unlike.astype(np.uint8), 3)
+    labels = regions(closed(unlike, config), config)
+    found = np.zeros(alike.shape, bool)
+    for label in range(1, int(labels.max(initial=0)) + 1):
+        region = labels == label
+        if unlike[region].mean() > UNLIKE_SHARE:
+            found |= region
+    return found
+
+
+def median_likeness(
+    grey: Float32, inverse_depth: Float32, rays: Float32, others: Sequence[PictureView]
+) -> Float32:
+    """Correlation ``(h, w)`` of an image's patches with those of ``others`` at ``inverse_depth (h, w)``.
+
+    The median over the views that see a pixel; NaN where none does. ``rays (h w, 3)`` are those of the pixels
+    of ``grey (h, w)``.
+    """
+    table = np.full((len(others), *grey.shape), np.nan, np.float32)
+    for row, view in zip(table, others, strict=True):
+        alike, seen = likeness(grey, inverse_depth.ravel(), rays, view, PATCH)
+        row[seen] = alike[seen]
+    return known_median(table)
+
+
+def _other_times(context: Context, frame: Frame, view: DenseView) -> list[Picture]:
+    wTc, (camera, time) = context.poses(), frame
+    times = [time + sign * offset for offset in context.config.match_offsets for sign in (-1, 1)]
+    return [
+        Picture(_grey(context, (camera, t), view), view.intrinsics, invert_pose(wTc[camera, t]) @ wTc[frame])
+        for t in times
+        if 0 <= t < context.workspace.frame_count
+    ]
+
+
+def _grey(context: Context, frame: Frame, view: DenseView) -> Float32:
+    return np.asarray(view.shrink(context.workspace.read("grey", frame)), np.float32)
