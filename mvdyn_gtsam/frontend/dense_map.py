@@ -30,6 +30,7 @@ from mvdyn_gtsam.geometry import backproject, invert_pose, pixel_rays, project, 
 
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
+Times = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,19 @@ class DepthView:
 
 
 @dataclass(frozen=True)
+class MeasuredView:
+    """Flow of one frame of a map to others, from which its depth follows wherever the frames are put."""
+
+    frame: int
+    """Row in the map."""
+    neighbours: tuple[int, ...]
+    measurement: StructurelessMeasurement
+    grid: Grid
+    image: Float32
+    """``(H, W)`` grey, smoothed to the grid's resolution."""
+
+
+@dataclass(frozen=True)
 class DenseMap:
     """A map with dense depth in some of its frames."""
 
@@ -80,6 +94,8 @@ class DenseMap:
     """Frames spread over the video."""
     rigidity: float
     """Share of the measured flow that a rigid scene explains to 1.5 px: what the map is worth."""
+    seen: tuple[MeasuredView, ...] = ()
+    """What ``views`` were solved from."""
 
 
 def testimony_flow(config: FlowConfig) -> FlowConfig:
@@ -99,21 +115,41 @@ RoughViews = dict[int, tuple[Image, Float32]]
 """Grey image and interpolated depth by frame of the map."""
 
 
-def densify_map(capture: Capture, camera_map: CameraMap, flow: DenseFlow, config: DenseMapConfig) -> DenseMap:
-    """Depth of a few frames, spread over the video, from flow to their neighbours in the map."""
+def densify_map(
+    capture: Capture, camera_map: CameraMap, flow: DenseFlow, config: DenseMapConfig, reach: int = 0
+) -> DenseMap:
+    """Depth of a few frames, spread over the video, from flow to their neighbours in the map.
+
+    Neighbours are up to ``reach`` frames of the map away, at least as many as there are of them.
+    """
     camera = capture.cameras[camera_map.camera]
     grid = Grid.covering(camera.width, camera.height, config.stride)
     count = len(camera_map.times)
     chosen = np.unique(np.linspace(0, count - 1, min(count, config.frames)).round().astype(int))
-    views, explained, measured = [], 0.0, 0.0
+    views, seen, explained, measured = [], [], 0.0, 0.0
     rough: RoughViews = {}
     for frame in chosen:
-        flows = _measure_flows(capture, camera_map, int(frame), grid, flow, config, rough)
-        view, fitting, total = _depth_view(camera, camera_map, int(frame), grid, flows, rough[frame], config)
+        flows = _measure_flows(
+            capture, camera_map, int(frame), grid, flow, config, rough, max(reach, config.neighbours)
+        )
+        seen.append(_measured(camera, int(frame), grid, flows, rough[frame], config.stride))
+        view, fitting, total = _depth_view(camera, camera_map.times, camera_map.mTc, 0.0, seen[-1], config)
         views.append(view)
         explained += fitting
         measured += total
-    return DenseMap(camera_map, tuple(views), explained / max(measured, 1e-12))
+    return DenseMap(camera_map, tuple(views), explained / max(measured, 1e-12), tuple(seen))
+
+
+def neighbours_of(frame: int, count: int, neighbours: int, reach: int) -> list[int]:
+    """The frame and up to ``neighbours`` on either side of it, evenly up to ``reach`` away."""
+    found = {frame}
+    for side, left in ((-1, frame), (1, count - 1 - frame)):
+        farthest = min(reach, left)
+        found |= {
+            frame + side * int(step)
+            for step in np.linspace(0, farthest, min(neighbours, farthest) + 1).round().astype(int)
+        }
+    return sorted(found)
 
 
 def _measure_flows(
@@ -124,12 +160,11 @@ def _measure_flows(
     flow: DenseFlow,
     config: DenseMapConfig,
     rough: RoughViews,
+    reach: int,
 ) -> Flows:
     """Flow of one frame to the map's frames before and after it; ``rough`` holds those views afterwards."""
     camera = capture.cameras[camera_map.camera]
-    last = len(camera_map.times) - 1
-    span = range(max(0, frame - config.neighbours), min(last, frame + config.neighbours) + 1)
-
+    span = neighbours_of(frame, len(camera_map.times), config.neighbours, reach)
     for passed in set(rough) - set(span):
         del rough[passed]
     for index in span:
@@ -195,16 +230,10 @@ def _sparse_depth(camera_map: CameraMap, frame: int, camera: Camera) -> Float32:
     return interpolate_sparse_depth(pixels, depth[front], camera.width, camera.height)
 
 
-def _depth_view(
-    camera: Camera,
-    camera_map: CameraMap,
-    frame: int,
-    grid: Grid,
-    flows: Flows,
-    rough: tuple[Image, Float32],
-    config: DenseMapConfig,
-) -> tuple[DepthView, float, float]:
-    """Dense depth of one frame; also the weight of its flow that fits, and of all of it."""
+def _measured(
+    camera: Camera, frame: int, grid: Grid, flows: Flows, rough: tuple[Image, Float32], stride: int
+) -> MeasuredView:
+    """What is seen from one frame of the map: its flow to others, and a rough depth to begin from."""
     grey, rough_depth = rough
     neighbours = list(flows)
     start = np.log(np.maximum(grid.sample(rough_depth), 1e-6)).astype(np.float64)
@@ -219,20 +248,48 @@ def _depth_view(
         weight=np.stack([flows[other].weight for other in neighbours]),
         steps=8,
     )
-    mTi, mTj = camera_map.mTc[frame], camera_map.mTc[neighbours]
-    log_depth, information = solve_log_depths(measurement, mTi, mTj, 0.0)
-    norms = edge_residuals(measurement, mTi, mTj, 0.0).norms_px
+    image = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 0.35 * stride)
+    return MeasuredView(frame, tuple(neighbours), measurement, grid, image)
+
+
+def _depth_view(
+    camera: Camera, times: Times, mTc: Array, log_scale: float, seen: MeasuredView, config: DenseMapConfig
+) -> tuple[DepthView, float, float]:
+    """Dense depth of one frame; also the weight of its flow that fits, and of all of it."""
+    measurement = seen.measurement
+    mTi, mTj = mTc[seen.frame], mTc[list(seen.neighbours)]
+    log_depth, information = solve_log_depths(measurement, mTi, mTj, log_scale)
+    norms = edge_residuals(measurement, mTi, mTj, log_scale).norms_px
     weight = measurement.weight
     fitting = np.where(np.nan_to_num(norms, nan=np.inf) < 1.5, weight, 0.0).sum(0)
     measured = weight.sum(0)
     sigma = config.flow_sigma_px / np.sqrt(np.maximum(information, 1e-12))
     sure = (sigma < config.depth_sigma) & (fitting > 0.5 * measured) & (measured > 0.5)
     view = DepthView(
-        time=int(camera_map.times[frame]),
+        time=int(times[seen.frame]),
         mTc=mTi,
         intrinsics=camera.intrinsics,
-        grid=grid,
+        grid=seen.grid,
         depth=np.where(sure, np.exp(log_depth), np.nan),
-        image=cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 0.35 * config.stride),
+        image=seen.image,
     )
     return view, float(fitting.sum()), float(measured.sum())
+
+
+def move_map(camera: Camera, dense: DenseMap, mTc: Array, config: DenseMapConfig) -> DenseMap:
+    """The map with its frames at other poses ``(K, 4, 4)``, in whatever scale, and the depth they imply."""
+    before, after = _spread(dense.sparse.mTc), _spread(mTc)
+    log_scale = float(np.log(after / before))
+    solved = [_depth_view(camera, dense.sparse.times, mTc, log_scale, seen, config) for seen in dense.seen]
+    return replace(
+        dense,
+        sparse=replace(dense.sparse, mTc=mTc, points=np.full_like(dense.sparse.points, np.nan)),
+        views=tuple(view for view, _, _ in solved),
+        rigidity=sum(fits for _, fits, _ in solved) / max(sum(total for _, _, total in solved), 1e-12),
+    )
+
+
+def _spread(mTc: Array) -> float:
+    """How far the frames' centres lie from their mean: what scale is told by."""
+    centres = mTc[:, :3, 3]
+    return max(float(np.linalg.norm(centres - centres.mean(0))), 1e-12)

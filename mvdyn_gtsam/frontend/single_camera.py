@@ -26,6 +26,10 @@ from mvdyn_gtsam.geometry import invert_pose, transform_points
 logger = logging.getLogger(__name__)
 
 
+LEAST_STEP = 0.005
+"""Narrowest step in image widths, 2.5 px of 512: a camera that stands still has no motion but noise."""
+
+
 @dataclass(frozen=True)
 class CameraMap:
     """Sparse map of one camera; m is the camera's own map frame, median depth 1.
@@ -52,12 +56,13 @@ class CameraMap:
 
 
 def choose_frames(
-    capture: Capture, camera: int, step: float, maximum: int
+    capture: Capture, camera: int, step: float, maximum: int, minimum: int = 2
 ) -> tuple[npt.NDArray[np.int64], float]:
     """Frame numbers spaced by image motion over the whole video, and that motion per frame as image widths.
 
     A new frame is taken each time the median optical flow since the last one adds up to ``step`` image
-    widths; wider steps where that would give more than ``maximum`` frames. First and last are always taken.
+    widths; wider steps where that would give more than ``maximum`` frames, narrower ones where it would give
+    fewer than ``minimum``. First and last are always taken.
     """
     flow_estimator = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     travelled = np.zeros(capture.frame_count)
@@ -72,7 +77,8 @@ def choose_frames(
             moved = np.median(np.linalg.norm(flow, axis=1)) / small.shape[1]
             travelled[time] = travelled[time - 1] + moved
         previous = np.asarray(small, np.uint8)
-    step = max(step, travelled[-1] / max(maximum - 1, 1))
+    narrowed = min(step, max(travelled[-1] / max(minimum - 1, 1), LEAST_STEP))
+    step = max(narrowed, travelled[-1] / max(maximum - 1, 1))
     chosen = [0]
     for time in range(1, capture.frame_count):
         if travelled[time] - travelled[chosen[-1]] >= step:

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
-from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map
+from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map, move_map, neighbours_of
 from mvdyn_gtsam.frontend.features import Features
 from mvdyn_gtsam.frontend.single_camera import CameraMap
-from mvdyn_gtsam.geometry import backproject, invert_pose, project, transform_points
+from mvdyn_gtsam.geometry import Similarity, backproject, invert_pose, project, transform_points
 from tests.tracking.synthetic_scene import HEIGHT, WIDTH, Scene, two_cameras
 
 FULL = FlowConfig(finest_scale=0)
@@ -72,6 +73,25 @@ def test_a_true_map_is_rigid_and_a_wrong_one_is_not(dense: DenseMap, scene: Scen
     assert bad.rigidity < 0.6
     given = [np.isfinite(view.depth).mean() for view in bad.views]
     assert np.mean(given) < 0.7 * np.mean([np.isfinite(view.depth).mean() for view in dense.views])
+
+
+def test_a_map_moved_as_a_whole_has_the_same_depth_in_its_new_scale(dense: DenseMap, scene: Scene) -> None:
+    wSm = Similarity(2.5, Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix(), np.array([1.0, 2.0, 3.0]))
+    moved = move_map(scene.cameras[0], dense, wSm.transform_poses(dense.sparse.mTc), CONFIG)
+    assert moved.rigidity == pytest.approx(dense.rigidity, abs=1e-3)
+    for before, after in zip(dense.views, moved.views, strict=True):
+        both = np.isfinite(before.depth) & np.isfinite(after.depth)
+        assert both.sum() > 0.98 * np.isfinite(before.depth).sum()
+        # a few points are torn between two depths
+        off = np.abs(after.depth[both] / (2.5 * before.depth[both]) - 1.0)
+        assert np.quantile(off, 0.99) < 1e-3
+        assert after.time == before.time and after.image is before.image
+
+
+def test_neighbours_reach_further_where_frames_are_closer() -> None:
+    assert neighbours_of(5, 20, 2, 2) == [3, 4, 5, 6, 7]
+    assert neighbours_of(5, 20, 2, 6) == [0, 3, 5, 8, 11]
+    assert neighbours_of(0, 3, 4, 8) == [0, 1, 2]
 
 
 def test_without_parallax_no_depth_is_sure() -> None:

@@ -61,6 +61,16 @@ def map_of_two_views(angle_deg: float, parallel: int = 0) -> CameraMap:
     return CameraMap(0, np.array([0, 5]), mTc, features, rows, points)
 
 
+def test_slow_or_short_videos_get_narrower_steps() -> None:
+    slow = panning(list(range(0, 90, 3)))
+    few, _ = choose_frames(slow, 0, step=0.15, maximum=40)
+    more, _ = choose_frames(slow, 0, step=0.15, maximum=40, minimum=8)
+    assert len(few) < 5 and 7 <= len(more) <= 9
+    # nothing moves: noise is not to be divided into steps
+    still, _ = choose_frames(panning([0] * 6), 0, step=0.15, maximum=40, minimum=8)
+    assert still.tolist() == [0, 5]
+
+
 @pytest.mark.parametrize("angle", [0.5, 2.0, 30.0])
 def test_triangulation_angle(angle: float) -> None:
     assert _median_triangulation_angle_deg(map_of_two_views(angle)) == pytest.approx(angle, rel=1e-6)

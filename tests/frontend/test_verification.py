@@ -62,6 +62,28 @@ def test_the_true_placement_is_trusted(views_a: list[DepthView], views_b: list[D
     assert 0.3 < verdict.agreement / verdict.frame_pairs < 2.0  # both directions of each pair count
 
 
+def test_a_fine_pattern_is_not_held_against_a_depth_within_tolerance() -> None:
+    """Depth that is 6 % off moves stripes by half their period: dark ones meet light ones."""
+    grid = Grid.covering(WIDTH, HEIGHT, STRIDE)
+    intrinsics = camera("any").intrinsics
+    across = np.arange(WIDTH)
+    stripes = np.tile(100.0 + 60.0 * np.sin(2.0 * np.pi * across / 8.5), (HEIGHT, 1)).astype(np.float32)
+
+    def striped(x: float, depth: float) -> DepthView:
+        shift = np.eye(4)
+        shift[0, 3] = x
+        # the wall is at depth 2 and shows its stripes to both
+        shifted = np.roll(stripes, -round(x * intrinsics[0, 0] / 2.0), axis=1)
+        return DepthView(0, shift, intrinsics, grid, np.full(len(grid), depth), shifted)
+
+    first, second = striped(0.0, 2.0 * 1.06), striped(1.0, 2.0 * 1.06)
+    hasty = verify_placement([first], [second], Similarity.identity(), CONFIG)
+    careful = verify_placement([first], [second], Similarity.identity(), CONFIG, careful=True)
+    assert hasty.contradiction > 0.3
+    assert hasty.contradiction > 10.0 * careful.contradiction
+    assert careful.agreement == hasty.agreement
+
+
 @pytest.mark.parametrize(
     "wrong",
     [

@@ -75,8 +75,8 @@ def test_a_weak_link_that_contradicts_strong_ones_loses() -> None:
 
 def test_a_repeated_texture_that_satisfies_one_pair_loses_against_what_all_pairs_say() -> None:
     wrong = similarity(1.0, (0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
-    links = [link(0, 1), link(1, 2, WEAK), link(0, 2, STRONG, wrong)]
     favour = {(0, 1): 2.0, (1, 2): 0.5, (0, 2): 1.0}
+    links = [link(0, 1, Verdict(2.0, 0.0, 4)), link(1, 2, WEAK), link(0, 2, Verdict(1.2, 0.0, 4), wrong)]
 
     def judge(a: int, b: int, aSb: Similarity) -> float:
         a, b, aSb = (a, b, aSb) if a < b else (b, a, aSb.inverse())
@@ -88,13 +88,18 @@ def test_a_repeated_texture_that_satisfies_one_pair_loses_against_what_all_pairs
     (group,) = connect([0, 1, 2], links, judge)
     assert_true(group)
     # Without the third camera's word it wins.
-    (misled,) = connect([0, 2], [link(0, 2, WEAK), links[2]], judge)
+    (misled,) = connect([0, 2], [link(0, 2, Verdict(1.0, 0.0, 4)), links[2]], judge)
     assert not np.allclose(misled[2].matrix(), group[2].matrix())
 
 
 def test_a_link_with_more_against_it_than_for_it_joins_nothing() -> None:
-    groups = connect([0, 1], [link(0, 1)], lambda a, b, aSb: -0.1)
+    against = Verdict(1.0, 1.1, 4)
+    groups = connect([0, 1], [link(0, 1, against)], lambda a, b, aSb: 1.0)
     assert [sorted(group) for group in groups] == [[0], [1]]
+    # The third camera's word counts as well.
+    links = [link(0, 1), link(1, 2, WEAK)]
+    groups = connect([0, 1, 2], links, lambda a, b, aSb: -1.0)
+    assert [sorted(group) for group in groups] == [[0, 1], [2]]
 
 
 def test_balance_weighs_both_sides() -> None:
