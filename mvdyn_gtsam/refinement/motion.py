@@ -151,7 +151,7 @@ def settle_task(context: Context, frame: Frame) -> None:
     # flow that a static depth explains is the best evidence against motion
     explained = static_residual(np.exp(theta), edges) < config.moving_px
     explained &= np.asarray(workspace.read("fails", frame)) == 0
-    around = grown(labels > 0, config) & ~explained | (labels > 0)
+    around = grown(labels > 0, config.moving_reach) & ~explained | (labels > 0)
     trust = context.trust(frame)
     trust[around] = 0.0
     # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
@@ -303,7 +303,7 @@ def _outlined(context: Context, frame: Frame, moves: Mask, around: Mask, theta: 
         OtherTime(
             grey=context.luminance((camera, t)),
             moves=grown(
-                np.asarray(workspace.read("fails", (camera, t)), np.uint8) > 0, context.config
+                np.asarray(workspace.read("fails", (camera, t))) > 0, context.config.background_margin
             ).astype(np.uint8),
             jTi=invert_pose(wTc[camera, t]) @ wTc[frame],
         )

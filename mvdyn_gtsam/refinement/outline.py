@@ -22,8 +22,6 @@ from mvdyn_gtsam.refinement.views import pixels_seen
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-WITNESSES = 2
-"""Other times that must see a background pixel."""
 NOTHING = -1000.0
 """Luminance outside an image."""
 
@@ -45,7 +43,7 @@ def background(
 ) -> Float32:
     """Luminance ``(M,)`` of what stands at ``inverse_depth (M,)`` along ``rays (M, 3)``.
 
-    The median of the other times that see it, NaN with fewer than two. ``intrinsics (3, 3)`` are those of the
+    The median of the other times that see it, NaN without any. ``intrinsics (3, 3)`` are those of the
     images.
     """
     seen = np.full((len(others), len(rays)), np.nan, np.float32)
@@ -54,16 +52,15 @@ def background(
         value = _sampled(other.grey, at, NOTHING)
         free = front & (value > 0.5 * NOTHING) & (_sampled(other.moves.astype(np.float32), at, 1.0) < 0.1)
         row[free] = value[free]
-    count = np.isfinite(seen).sum(axis=0)
     result = np.full(len(rays), np.nan, np.float32)
-    known = count >= WITNESSES
+    known = np.isfinite(seen).any(axis=0)
     result[known] = np.nanmedian(seen[:, known], axis=0)
     return result
 
 
-def grown(mask: Mask, config: RefinementConfig) -> Mask:
-    """``mask (h, w)`` and what is near enough to belong to it."""
-    radius = max(1, round(config.moving_reach * mask.shape[1]))
+def grown(mask: Mask, reach: float) -> Mask:
+    """``mask (h, w)`` and what is as near as ``reach``, a share of the width."""
+    radius = max(1, round(reach * mask.shape[1]))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0)
 
 
