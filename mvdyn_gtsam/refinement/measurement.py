@@ -13,15 +13,12 @@ from mvdyn_gtsam.frontend.guided_flow import guided_weight, predicted_flow
 from mvdyn_gtsam.frontend.plane_sweep import SweepConfig, SweepView, SweptDepth, ladder_of, sweep
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
+from mvdyn_gtsam.refinement.neighbours import times_in_view
 from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.views import DenseView, pixels_seen
+from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
 Array = npt.NDArray[np.float64]
-
-
-SHARED_RASTER = 12
-"""Points across and down an image at which it is asked whether another time sees them."""
 
 
 def sweep_frame(
@@ -35,7 +32,10 @@ def sweep_frame(
     views = [DenseView.of(view.camera, config.scale) for view in workspace.views]
     own = views[camera]
     sources = [(other, time) for other in group if other != camera]
-    sources += [(camera, t) for t in other_times(workspace, frame, wTc, config)]
+    sources += [
+        (camera, t)
+        for t in times_in_view(workspace, frame, wTc, config.temporal_offsets, config.least_shared)
+    ]
     others = [
         SweepView(
             grey=np.asarray(views[j[0]].shrink(workspace.read("grey", j)), np.uint8),
@@ -62,38 +62,6 @@ def sweep_frame(
         for image in (found.inverse_depth, found.instant)
     ]
     return SweptDepth(*grown)
-
-
-def other_times(workspace: Workspace, frame: Frame, wTc: Array, config: SweepConfig) -> list[int]:
-    """Times of the camera whose images a frame is compared with, in order.
-
-    Those of ``temporal_offsets``, each halved until enough of the view is shared: 8 frames are a step aside
-    of a camera held still, and another room of one that is carried around.
-    """
-    camera, time = frame
-    view = workspace.views[camera]
-    across = np.rint(np.linspace(0, view.shape[1] - 1, SHARED_RASTER)).astype(np.int64)
-    down = np.rint(np.linspace(0, view.shape[0] - 1, SHARED_RASTER)).astype(np.int64)
-    points = (down[:, None] * view.shape[1] + across).ravel()
-    inverse_depth = np.asarray(workspace.read("tracked", frame), np.float32).ravel()[points]
-    size = np.array(view.shape[::-1])
-
-    def shared(other: int) -> float:
-        if not 0 <= other < workspace.frame_count:
-            return 0.0
-        jTi = invert_pose(wTc[camera, other]) @ wTc[frame]
-        at, front = pixels_seen(inverse_depth, view.rays[points], jTi, view.intrinsics)
-        return float((front & (at >= -0.5).all(axis=1) & (at < size - 0.5).all(axis=1)).mean())
-
-    found = set()
-    for offset in config.temporal_offsets:
-        for sign in (-1, 1):
-            step = offset
-            while step > 1 and shared(time + sign * step) < config.least_shared:
-                step //= 2
-            if 0 <= time + sign * step < workspace.frame_count:
-                found.add(time + sign * step)
-    return sorted(found)
 
 
 def _samples(workspace: Workspace, frame: Frame) -> Float32:

@@ -36,7 +36,7 @@ def moved(grey: np.ndarray, label: int) -> np.ndarray:
 
 
 def found_in(grey: np.ndarray, depth: float, others: list[Picture]) -> StaticRegions:
-    alike = median_likeness(grey, at(depth).reshape(SHAPE), VIEW.rays, others)
+    alike, _ = median_likeness(grey, at(depth).reshape(SHAPE), VIEW.rays, others)
     return static_regions(labels(), alike, contrast(grey, PATCH) > TEXTURE, ALIKE)
 
 
@@ -76,7 +76,8 @@ def test_what_no_other_time_sees_is_left_open() -> None:
 def test_what_is_alike_at_no_depth_moves_unless_flow_explains_it() -> None:
     grey, side = wall_and_side()
     image = moved(grey, 2)
-    alike = median_likeness(image, at(WALL).reshape(SHAPE), VIEW.rays, [side])
+    alike, views = median_likeness(image, at(WALL).reshape(SHAPE), VIEW.rays, [side])
+    assert views[30, 40] == 1 and views[30, 0] == 0
     # patches of single pixels of noise are alike by chance here and there
     config = RefinementConfig(unlike_likeness=0.5)
     found = unlike_regions(alike, np.ones(SHAPE, bool), config)

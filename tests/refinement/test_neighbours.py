@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from mvdyn_gtsam.capture.model import Camera
-from mvdyn_gtsam.frontend.plane_sweep import SweepConfig
-from mvdyn_gtsam.refinement.measurement import other_times
+from mvdyn_gtsam.refinement.neighbours import times_in_view
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
 FRAMES, DEPTH, FOCAL, WIDTH = 40, 2.0, 30.0, 32
-CONFIG = SweepConfig(temporal_offsets=(4, 16), least_shared=0.6)
+OFFSETS, SHARED = (4, 16), 0.6
 
 
 @pytest.fixture
@@ -37,20 +36,20 @@ def moving(px_per_frame: float) -> np.ndarray:
 
 
 def test_a_slow_camera_is_compared_at_the_distances_asked_for(wall: Workspace) -> None:
-    assert other_times(wall, (0, 20), moving(0.1), CONFIG) == [4, 16, 24, 36]
+    assert times_in_view(wall, (0, 20), moving(0.1), OFFSETS, SHARED) == [4, 16, 24, 36]
 
 
 def test_a_fast_one_nearer_where_enough_is_shared(wall: Workspace) -> None:
     # 2 px per frame: 4 frames share three quarters of the view, 16 and 8 less than half
-    assert other_times(wall, (0, 20), moving(2.0), CONFIG) == [16, 24]
+    assert times_in_view(wall, (0, 20), moving(2.0), OFFSETS, SHARED) == [16, 24]
     # 40 % are gone after 12.8 px: 2 frames
-    assert other_times(wall, (0, 20), moving(5.0), CONFIG) == [18, 22]
+    assert times_in_view(wall, (0, 20), moving(5.0), OFFSETS, SHARED) == [18, 22]
 
 
 def test_the_fastest_is_compared_with_its_neighbours(wall: Workspace) -> None:
-    assert other_times(wall, (0, 20), moving(100.0), CONFIG) == [19, 21]
+    assert times_in_view(wall, (0, 20), moving(100.0), OFFSETS, SHARED) == [19, 21]
 
 
 def test_at_the_ends_of_the_video_only_what_there_is(wall: Workspace) -> None:
-    assert other_times(wall, (0, 0), moving(0.1), CONFIG) == [4, 16]
-    assert other_times(wall, (0, FRAMES - 3), moving(0.1), CONFIG) == [21, 33, 39]
+    assert times_in_view(wall, (0, 0), moving(0.1), OFFSETS, SHARED) == [4, 16]
+    assert times_in_view(wall, (0, FRAMES - 3), moving(0.1), OFFSETS, SHARED) == [21, 33, 39]
