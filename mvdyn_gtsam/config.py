@@ -11,7 +11,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from mvdyn_gtsam.config_tree import ConfigKey, build, describe_tree, parse_override, read_file, to_plain
+from mvdyn_gtsam.config_tree import (
+    ConfigKey,
+    build,
+    check,
+    describe_tree,
+    flatten,
+    nest,
+    parse_override,
+    read_file,
+    to_plain,
+)
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_flow import FlowConfig
 from mvdyn_gtsam.frontend.wide_baseline import WideBaselineConfig
@@ -175,18 +185,27 @@ class Config:
 
 
 def load_config(file: Path | str | None = None, overrides: Sequence[str] = ()) -> Config:
-    """The defaults, changed by ``file`` (TOML or JSON, sections as tables), changed by ``overrides``.
+    """The defaults, changed as ``load_settings`` says; raises ConfigError as that does."""
+    return build(Config, load_settings(file, overrides))
+
+
+def load_settings(
+    file: Path | str | None = None, overrides: Sequence[str] = (), *, alone: bool = True
+) -> dict[str, Any]:
+    """Nested values of ``file`` (TOML or JSON, sections as tables), changed by ``overrides``.
 
     An override is ``"section.key=value"`` with the value in TOML syntax, quotes around strings optional.
-    Raises ConfigError, one line, for an unknown key (naming the closest one), a value of the wrong type
-    or out of range, and a file that cannot be read.
+    Raises ConfigError, one line, for an unknown key (naming the closest one), a value of the wrong type and a
+    file that cannot be read; where they stand ``alone``, beside defaults, also for a value out of range.
     """
     values: dict[str, Any] = {} if file is None else read_file(Path(file))
+    examine: Callable[[type[Any], Mapping[str, Any]], Any] = build if alone else check
     # The file alone first, so that its mistakes are reported as the file's.
-    _named(lambda: build(Config, values), str(file))
+    _named(lambda: examine(Config, values), str(file))
     for override in overrides:
         parse_override(Config, override, values)
-    return _named(lambda: build(Config, values), "--set" if overrides else str(file))
+    _named(lambda: examine(Config, values), "--set" if overrides else str(file))
+    return values
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:
@@ -199,13 +218,26 @@ def to_dict(config: Config) -> dict[str, Any]:
     return to_plain(config)
 
 
+def given_settings(config: Config | Mapping[str, Any] | None) -> dict[str, Any]:
+    """What ``config`` asks for, as nested plain values.
+
+    A mapping (``{"tracking": {"window": 20}}``) asks for what it holds; a ``Config``, which has a value for
+    every key, for what differs from the defaults. Raises ConfigError for an unknown key or a value of the
+    wrong type.
+    """
+    if not isinstance(config, Config):
+        return to_plain(check(Config, config or {}))
+    defaults = flatten(to_dict(Config()))
+    return nest({key: value for key, value in flatten(to_dict(config)).items() if value != defaults[key]})
+
+
 def describe() -> list[ConfigKey]:
     """Every key with its default and its help text, in order."""
     return describe_tree(Config())
 
 
-def _named(make: Callable[[], Config], origin: str) -> Config:
+def _named(examine: Callable[[], object], origin: str) -> None:
     try:
-        return make()
+        examine()
     except ConfigError as error:
         raise ConfigError(f"{origin}: {error}; `mvdyn config` lists every key") from error

@@ -35,28 +35,59 @@ class ConfigKey:
     """Help text with the source of the default."""
 
 
-def build(kind: type[Section], values: Mapping[str, Any], prefix: str = "") -> Section:
+def build(kind: type[Section], values: Mapping[str, Any]) -> Section:
     """An instance of the dataclass ``kind`` with its defaults changed by nested ``values``.
 
     Raises ConfigError for a key that ``kind`` does not have and for a value of another type.
     """
+    return _instance(kind, check(kind, values))
+
+
+def check(kind: type[Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested ``values`` in the types of the dataclass ``kind``. Raises ConfigError as ``build`` does, but not
+    for values out of range, which may depend on one another."""
+    taken, refused = sift(kind, values)
+    if refused:
+        raise ConfigError(next(iter(refused.values())))
+    return taken
+
+
+def sift(
+    kind: type[Any], values: Mapping[str, Any], prefix: str = ""
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Those of nested ``values`` that the dataclass ``kind`` takes, in its types; for the others, by dotted
+    key, why it does not."""
     hints = typing.get_type_hints(kind)
-    fields = {item.name: item for item in dataclasses.fields(typing.cast(Any, kind))}
-    arguments: dict[str, Any] = {}
+    names = {item.name for item in dataclasses.fields(kind)}
+    taken: dict[str, Any] = {}
+    refused: dict[str, str] = {}
     for name, value in values.items():
         key = f"{prefix}{name}"
-        if name not in fields:
-            raise ConfigError(unknown_key(key, kind, prefix))
-        hint = hints[name]
-        if dataclasses.is_dataclass(hint):
-            if not isinstance(value, Mapping):
-                raise ConfigError(
-                    f"{key} is a section, not a value; set a key of it, e.g. {_first_key(hint, key)}"
-                )
-            arguments[name] = build(typing.cast(type[Any], hint), value, f"{key}.")
+        if name not in names:
+            refused[key] = unknown_key(key, kind, prefix)
+        elif not dataclasses.is_dataclass(hints[name]):
+            try:
+                taken[name] = convert(value, hints[name], key)
+            except ConfigError as error:
+                refused[key] = str(error)
+        elif isinstance(value, Mapping):
+            taken[name], below = sift(typing.cast(type[Any], hints[name]), value, f"{key}.")
+            refused.update(below)
         else:
-            arguments[name] = convert(value, hint, key)
-    return kind(**arguments)
+            example = _first_key(hints[name], key)
+            refused[key] = f"{key} is a section, not a value; set a key of it, e.g. {example}"
+    return taken, refused
+
+
+def _instance(kind: type[Section], taken: Mapping[str, Any]) -> Section:
+    hints = typing.get_type_hints(kind)
+    sections = {name for name in taken if dataclasses.is_dataclass(hints[name])}
+    return kind(
+        **{
+            name: _instance(hints[name], value) if name in sections else value
+            for name, value in taken.items()
+        }
+    )
 
 
 def unknown_key(key: str, kind: type[Any], prefix: str) -> str:
@@ -172,6 +203,8 @@ def to_plain(value: Any) -> Any:
     """``value`` as dicts, lists, numbers, strings and booleans; None as the empty string, as TOML needs."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {item.name: to_plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {name: to_plain(item) for name, item in value.items()}
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, tuple | list):
@@ -179,6 +212,29 @@ def to_plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return "" if value is None else value
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested ``values`` by dotted key."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat.update(flatten(value, f"{prefix}{name}."))
+        else:
+            flat[f"{prefix}{name}"] = value
+    return flat
+
+
+def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """The inverse of ``flatten``."""
+    values: dict[str, Any] = {}
+    for key, value in flat.items():
+        *sections, name = key.split(".")
+        table = values
+        for section in sections:
+            table = table.setdefault(section, {})
+        table[name] = value
+    return values
 
 
 def describe_tree(section: Any, prefix: str = "") -> list[ConfigKey]:

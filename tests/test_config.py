@@ -10,8 +10,16 @@ from typing import Any, Literal
 
 import pytest
 
-from mvdyn_gtsam.config import Config, config_from_dict, describe, load_config, to_dict
-from mvdyn_gtsam.config_tree import build, to_plain
+from mvdyn_gtsam.config import (
+    Config,
+    config_from_dict,
+    describe,
+    given_settings,
+    load_config,
+    load_settings,
+    to_dict,
+)
+from mvdyn_gtsam.config_tree import build, flatten, nest, sift, to_plain
 from mvdyn_gtsam.errors import ConfigError
 
 
@@ -128,3 +136,41 @@ def test_every_kind_of_value_round_trips() -> None:
 def test_every_kind_of_value_is_checked(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build(Everything, values)
+
+
+def test_settings_are_what_is_asked_for_and_nothing_else(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text("[tracking]\nwindow = 30\n[graph]\ntemporal_offsets = [1, 3]\n")
+    asked: dict[str, Any] = {"tracking": {"window": 25, "free": 9}, "graph": {"temporal_offsets": [1, 3]}}
+    overrides = ["tracking.window=25", "tracking.free=9"]
+    assert load_settings(file, overrides) == asked
+    assert given_settings(asked) == asked
+    assert given_settings({"graph": {"temporal_offsets": (1, 3)}}) == {"graph": {"temporal_offsets": [1, 3]}}
+    # Of a Config it cannot be told that 25 was asked for.
+    del asked["tracking"]["window"]
+    assert given_settings(load_config(file, overrides)) == asked
+    assert given_settings(None) == given_settings(Config()) == {}
+    with pytest.raises(ConfigError, match=r"did you mean tracking\.window"):
+        given_settings({"tracking": {"windw": 3}})
+
+
+def test_settings_that_do_not_stand_alone_are_not_held_against_the_defaults() -> None:
+    assert load_settings(None, ["tracking.free=30"], alone=False) == {"tracking": {"free": 30}}
+    with pytest.raises(ConfigError, match="--set: tracking.free is 30"):
+        load_settings(None, ["tracking.free=30"])
+    with pytest.raises(ConfigError, match="--set: tracking.free is 'x'; it must be a whole number"):
+        load_settings(None, ["tracking.free=x"], alone=False)
+
+
+def test_what_is_not_understood_is_sifted_out() -> None:
+    values = {"tracking": {"window": 30, "gone": 1, "free": "all"}, "graph": 3, "old": {"a": 1}}
+    taken, refused = sift(Config, values)
+    assert taken == {"tracking": {"window": 30}}
+    assert set(refused) == {"tracking.gone", "tracking.free", "graph", "old"}
+    assert sift(Everything, to_plain(Everything()))[1] == {}
+
+
+def test_flat_and_nested_are_the_same() -> None:
+    nested = to_dict(Config())
+    assert nest(flatten(nested)) == nested
+    assert flatten(nested)["tracking.window"] == 25
