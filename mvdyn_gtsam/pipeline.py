@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from mvdyn_gtsam.frontend.threads import in_order
 from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer, WideBaselineInitializer
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction import CaptureInfo, Reconstruction, ReconstructionWriter
+from mvdyn_gtsam.resuming import RunConfig, configure
 from mvdyn_gtsam.tracking.model import FrameDepth, TrackingResult
 from mvdyn_gtsam.tracking.tracker import Tracker
 
@@ -36,7 +37,7 @@ STAGES = ("tracking", "refinement")
 def reconstruct(
     capture: Capture,
     out: Path | str,
-    config: Config | None = None,
+    config: Config | Mapping[str, Any] | None = None,
     *,
     stage: str = "refinement",
     resume: bool = False,
@@ -47,22 +48,31 @@ def reconstruct(
     """Recover every camera's pose and depth at every frame and write them to ``out``.
 
     ``stage`` is the last one to run, one of ``STAGES``. ``flow`` and ``initializer`` replace the classical
-    measurements; a flow that cannot be pickled needs ``refinement.workers=1``. With ``resume`` what ``out``
-    already holds is not computed again. Raises TrackingError when nothing can be reconstructed, ResultError
-    when ``out`` cannot be used.
+    measurements; a flow that cannot be pickled needs ``refinement.workers=1``. ``config`` may be nested
+    settings, e.g. ``{"tracking": {"window": 20}}``; the others have their defaults.
+
+    With ``resume`` what ``out`` already holds is not computed again, and the run goes on with the settings it
+    began with, those of stages to come too. ``config`` may change them for stages that are not finished; of a
+    ``Config`` what differs from the defaults counts as asked for. Settings that are new since take their
+    defaults.
+
+    Raises TrackingError when nothing can be reconstructed, ResultError when ``out`` cannot be used or a
+    finished stage was made with other settings than ``config`` asks for.
     """
     if stage not in STAGES:
         raise ValueError(f"unknown stage {stage!r}; there are {', '.join(STAGES)}")
-    config = config if config is not None else Config()
+    out = Path(out)
+    run = configure(out, config, resume=resume)
+    config = run.config
     progress = progress if progress is not None else NullProgress()
     flow = flow if flow is not None else DisFlow(config.frontend.flow)
     if initializer is None:
         testimony = DisFlow(testimony_flow(config.frontend.flow))
         initializer = ClassicalInitializer(testimony, config.frontend.wide_baseline)
-    out = Path(out)
     writer = ReconstructionWriter.create(
         out, CaptureInfo.from_capture(capture), to_dict(config), resume=resume
     )
+    run.log()
     with writer:
         if not writer.stage_finished("tracking"):
             start = _start(capture, initializer, writer, progress)
@@ -70,6 +80,7 @@ def reconstruct(
             _note_groups(capture, start, writer)
             _track(capture, start, flow, config, writer, progress)
         if stage == "refinement" and not writer.stage_finished("refinement"):
+            _warn_of_new_start(run, writer)
             _refine(capture, flow, config, writer, progress)
     return Reconstruction.load(out)
 
@@ -142,7 +153,7 @@ def _refine(
     began = perf_counter()
     tracked = _tracked(capture, writer)
     refinement = Refinement(
-        tracked, writer.refinement_folder / "work", config.refinement, flow, config.frontend.flow, progress
+        tracked, _workspace(writer), config.refinement, flow, config.frontend.flow, progress
     )
     _announce_refinement(tracked, config, writer)
     names = [camera.name for camera in capture.cameras]
@@ -163,6 +174,17 @@ def _refine(
     writer.finish_stage("refinement", perf_counter() - began)
     refinement.remove()
     shutil.rmtree(writer.refinement_folder, ignore_errors=True)
+
+
+def _warn_of_new_start(run: RunConfig, writer: ReconstructionWriter) -> None:
+    """A refinement keeps its steps only as long as its settings stay (``Workspace.prepare``)."""
+    keys = [key for key in run.changed if key.startswith(("refinement.", "frontend.flow."))]
+    if keys and _workspace(writer).is_dir():
+        logger.warning("the refinement begins anew, its settings are others: %s", ", ".join(keys))
+
+
+def _workspace(writer: ReconstructionWriter) -> Path:
+    return writer.refinement_folder / "work"
 
 
 def _announce_refinement(tracked: Tracked, config: Config, writer: ReconstructionWriter) -> None:

@@ -161,6 +161,37 @@ def test_a_stopped_run_continues_without_a_new_start(
     np.testing.assert_allclose(all_poses(finished), all_poses(result), atol=1e-9, rtol=0)
 
 
+def test_resuming_goes_on_with_the_settings_it_began_with(
+    result: Reconstruction, scene: Scene, start: GivenStart, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def stop(*_: object) -> None:
+        raise StoppedError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(TASKS, "wide flow", stop)
+        with pytest.raises(StoppedError):
+            reconstruct(scene.capture(), tmp_path, config(), initializer=start)
+    before = (tmp_path / "manifest.json").read_bytes()
+    with pytest.raises(ResultError, match=r"tracking\.grid_points=300, not 200; leave that out"):
+        other: dict[str, Any] = {"tracking": {"grid_points": 200}}
+        reconstruct(scene.capture(), tmp_path, other, initializer=start, resume=True)
+    assert (tmp_path / "manifest.json").read_bytes() == before
+    # the refinement is not finished: it is done with what is asked for now, from its beginning
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(TASKS, "sweep", stop)
+        with pytest.raises(StoppedError):
+            other = {"refinement": {"sweep": {"levels": 20}}}
+            reconstruct(scene.capture(), tmp_path, other, initializer=start, resume=True)
+    assert "the refinement begins anew, its settings are others: refinement.sweep.levels" in caplog.text
+    caplog.clear()
+    finished = reconstruct(scene.capture(), tmp_path, initializer=start, resume=True)
+    made = dict(finished.manifest["config"])
+    assert made["refinement"]["sweep"]["levels"] == 20 and "begins anew" not in caplog.text
+    made["refinement"] = result.manifest["config"]["refinement"]
+    assert made == result.manifest["config"]
+    np.testing.assert_array_equal(all_poses(finished.tracked()), all_poses(result.tracked()))
+
+
 def test_resuming_what_is_finished_computes_nothing(
     result: Reconstruction, scene: Scene, start: GivenStart
 ) -> None:

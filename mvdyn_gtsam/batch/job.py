@@ -13,8 +13,9 @@ from pathlib import Path
 from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
 from mvdyn_gtsam.batch.clips import Clip, groundtruth_of, has_groundtruth
 from mvdyn_gtsam.batch.report import Row, State
-from mvdyn_gtsam.errors import MvdynError
+from mvdyn_gtsam.errors import MvdynError, ResultError
 from mvdyn_gtsam.reconstruction import Reconstruction, is_reconstruction
+from mvdyn_gtsam.resuming import resumed
 
 RUN_FILE = "run"
 CONFIG_FILE = "config.json"
@@ -52,7 +53,7 @@ class Plan:
 
     @property
     def config_file(self) -> Path:
-        """The whole configuration."""
+        """The settings that are asked for; the others have their defaults, or what a clip began with."""
         return self.state_folder / CONFIG_FILE
 
     def result(self, clip: Clip) -> Path:
@@ -86,21 +87,19 @@ def reconstruct_clip(clip: Clip, plan: Plan) -> Row:
 
 
 def is_finished(clip: Clip, plan: Plan) -> bool:
-    """Whether the result is there, made with the plan's configuration.
+    """Whether the result is there, made with the settings that the plan asks for.
 
-    With another one it is not: ``mvdyn reconstruct --resume`` then says what differs.
+    With others it is not: ``mvdyn reconstruct --resume`` then says what differs.
     """
     if not is_reconstruction(plan.result(clip)):
         return False
     result = Reconstruction.load(plan.result(clip))
-    wanted = json.loads(plan.config_file.read_text())
-    made = dict(result.manifest["config"])
-    for config in (made, wanted):
-        # As --resume has it: the number of processes changes nothing, nor what no stage has used yet.
-        refinement = dict(config.pop("refinement", {}))
-        refinement.pop("workers", None)
-        config["refinement"] = refinement if "refinement" in result.stages else None
-    return plan.stage in result.stages and made == wanted
+    asked = json.loads(plan.config_file.read_text())
+    try:
+        resumed(result.manifest["config"], result.stages, asked)
+    except ResultError:
+        return False
+    return plan.stage in result.stages
 
 
 def needs_scores(clip: Clip, plan: Plan, row: Row | None) -> bool:
@@ -153,7 +152,7 @@ def _run(clip: Clip, plan: Plan) -> ProcessUsage:
     command = [*(plan.command or (sys.executable, "-m", "mvdyn_gtsam.cli.main", "reconstruct"))]
     command += [str(clip.folder), "--out", str(plan.result(clip)), "--stage", plan.stage, "--resume"]
     command += ["--config", str(plan.config_file)]
-    if json.loads(plan.config_file.read_text())["refinement"]["workers"] == 0:  # else it was asked for
+    if not json.loads(plan.config_file.read_text()).get("refinement", {}).get("workers"):  # 0 is the default
         command += ["--set", f"refinement.workers={threads}"]
     environment = {**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), str(threads))}
     environment["PYTHON_CPU_COUNT"] = str(threads)  # what os.cpu_count() says, from Python 3.13 on

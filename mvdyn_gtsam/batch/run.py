@@ -8,16 +8,17 @@ import functools
 import importlib.util
 import logging
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from mvdyn_gtsam.batch.clips import BatchError, Clip, find_clips, has_groundtruth
 from mvdyn_gtsam.batch.job import Plan, described, is_finished, needs_scores, reconstruct_clip
 from mvdyn_gtsam.batch.report import BatchReport, Row, State, read_rows
 from mvdyn_gtsam.batch.scheduling import local_cluster, remote_cluster, require_dask, run_clips
-from mvdyn_gtsam.config import Config, to_dict
+from mvdyn_gtsam.config import Config, given_settings
 from mvdyn_gtsam.errors import MvdynError
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction.files import write_atomically, write_json
@@ -52,7 +53,7 @@ class BatchSettings:
 def run_batch(
     folder: Path,
     out: Path,
-    config: Config | None = None,
+    config: Config | Mapping[str, Any] | None = None,
     settings: BatchSettings | None = None,
     *,
     progress: Progress | None = None,
@@ -61,7 +62,8 @@ def run_batch(
     """Reconstruct every capture below ``folder`` into ``out/<name>``; may be called again to go on.
 
     ``out/<name>.log`` holds what each said, ``out/batch.json`` and ``batch.md`` the table, written anew after
-    each clip. A clip that fails is a row. Raises BatchError, in one line, where nothing can be started or
+    each clip. ``config`` is as in ``reconstruct`` with ``resume``: clips that were begun keep their settings.
+    A clip that fails is a row. Raises BatchError, in one line, where nothing can be started or
     another batch works on ``out``.
     """
     settings = settings or BatchSettings()
@@ -78,7 +80,7 @@ def run_batch(
         settings.evaluate,
         settings.command,
     )
-    with _claimed(plan, config or Config()):
+    with _claimed(plan, given_settings(config)):
         earlier = read_rows(plan.out / "batch.json")
         rows = {clip.name: _known(clip, plan, earlier.get(clip.name)) for clip in clips}
         todo = [clip for clip in clips if _is_left(clip, plan, rows[clip.name], settings)]
@@ -175,7 +177,7 @@ def _require_evaluation(clips: Sequence[Clip]) -> None:
 
 
 @contextmanager
-def _claimed(plan: Plan, config: Config) -> Iterator[None]:
+def _claimed(plan: Plan, asked: Mapping[str, Any]) -> Iterator[None]:
     """``plan.out`` is this run's alone. Raises BatchError where it cannot be."""
     try:
         plan.state_folder.mkdir(parents=True, exist_ok=True)
@@ -187,7 +189,7 @@ def _claimed(plan: Plan, config: Config) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise BatchError(f"{plan.out}: another batch is working on it; wait for it to end") from error
-        write_json(plan.config_file, to_dict(config))
+        write_json(plan.config_file, asked)
         write_atomically(plan.run_file, plan.run.encode())
         try:
             yield

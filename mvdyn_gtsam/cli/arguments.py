@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mvdyn_gtsam.errors import CaptureError
 
@@ -54,13 +54,20 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def read_config(arguments: argparse.Namespace) -> Config:
-    """The configuration the arguments ask for. Raises ConfigError."""
-    from mvdyn_gtsam.config import load_config
+    """The whole configuration the arguments ask for. Raises ConfigError."""
+    from mvdyn_gtsam.config import config_from_dict
+
+    return config_from_dict(read_settings(arguments))
+
+
+def read_settings(arguments: argparse.Namespace, *, alone: bool = True) -> dict[str, Any]:
+    """The settings the arguments name, nested; ``alone`` as in ``load_settings``. Raises ConfigError."""
+    from mvdyn_gtsam.config import load_settings
 
     overrides = list(arguments.overrides)
     if getattr(arguments, "truncate", False):
         overrides.append("capture.truncate=true")
-    return load_config(arguments.config, overrides)
+    return load_settings(arguments.config, overrides, alone=alone)
 
 
 def read_capture(arguments: argparse.Namespace, config: Config) -> Capture:

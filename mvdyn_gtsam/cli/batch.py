@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mvdyn_gtsam.cli.arguments import add_config_arguments, read_config
+from mvdyn_gtsam.cli.arguments import add_config_arguments, read_settings
 from mvdyn_gtsam.cli.progress import ConsoleProgress
 from mvdyn_gtsam.cli.reconstruct import STAGES
 
@@ -18,7 +18,9 @@ Reconstruct every capture below FOLDER (any layout that reconstruct takes, up to
 once on Dask distributed: on worker processes of this machine, or on those of a running scheduler. OUT gets
 one result folder and one log per clip, and batch.json and batch.md with a table of all.
 A clip that fails stops no other. The same command again keeps what is finished, goes on with what was
-interrupted, and tries again what failed; remove OUT/<clip> to have it made anew.
+interrupted, and tries again what failed; remove OUT/<clip> to have it made anew. A clip that was begun keeps
+its settings, as with reconstruct --resume: it fails where --set or --config ask for others than a finished
+stage was made with.
 Needs the extra: pip install 'mvdyn_gtsam[batch]', and 'mvdyn_gtsam[eval]' to score what has ground truth."""
 EPILOG = """\
 examples:
@@ -71,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, messages: Console) -> int:
     """Run the verb."""
-    config = read_config(arguments)
+    asked = read_settings(arguments)
     from mvdyn_gtsam.batch import BatchError, BatchSettings, Row, run_batch
 
     def tell(row: Row) -> None:
@@ -91,7 +93,7 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
     try:
         with ConsoleProgress(messages) as progress:
             report = run_batch(
-                arguments.folder, arguments.out, config, settings, progress=progress, on_row=tell
+                arguments.folder, arguments.out, asked, settings, progress=progress, on_row=tell
             )
     except KeyboardInterrupt:
         messages.print("stopped; what is finished is kept, and the same command goes on")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import shutil
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from mvdyn_gtsam.cli.arguments import add_capture_arguments, add_config_arguments, read_capture, read_config
+from mvdyn_gtsam.cli.arguments import add_capture_arguments, add_config_arguments, read_capture, read_settings
 from mvdyn_gtsam.cli.progress import ConsoleProgress
 from mvdyn_gtsam.errors import ResultError
 
@@ -23,7 +24,9 @@ SUMMARY = "recover every camera's pose and depth for every frame"
 DESCRIPTION = """\
 Recover the pose of every camera and a dense depth map for every frame, in one world frame.
 OUT gets manifest.json, trajectories/<camera>.txt (TUM, camera-to-world), depth/ and confidence/.
-Ctrl-C at any time: what is in OUT can be read, and --resume continues."""
+Ctrl-C at any time: what is in OUT can be read, and --resume continues, with the settings it began with:
+--set and --config may change those of stages that are not finished; settings that are new since take their
+defaults, and those that are no more are left out with a warning."""
 EPILOG = """\
 examples:
   mvdyn reconstruct clip --out result
@@ -50,7 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_config_arguments(parser)
     again = parser.add_mutually_exclusive_group()
-    again.add_argument("--resume", action="store_true", help="continue the run that OUT holds")
+    again.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue the run that OUT holds, with the settings it began with",
+    )
     again.add_argument(
         "--overwrite", action="store_true", help="remove the reconstruction that OUT holds first"
     )
@@ -59,15 +66,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, messages: Console) -> int:
     """Run the verb."""
     from mvdyn_gtsam.reconstruction import refuse_unusable
+    from mvdyn_gtsam.resuming import configure
 
-    config = read_config(arguments)
+    settings = read_settings(arguments, alone=not arguments.resume)
     refuse_unusable(arguments.out, resume=arguments.resume, overwrite=arguments.overwrite)
+    config = configure(arguments.out, settings, resume=arguments.resume).config
     capture = read_capture(arguments, config)
     started = time.monotonic()
     result = reconstruct_with_progress(
         capture,
         arguments.out,
-        config,
+        settings,
         stage=arguments.stage,
         resume=arguments.resume,
         overwrite=arguments.overwrite,
@@ -81,7 +90,7 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
 def reconstruct_with_progress(
     capture: Capture,
     out: Path,
-    config: Config,
+    config: Config | Mapping[str, Any],
     *,
     stage: str,
     resume: bool,

@@ -70,16 +70,18 @@ class ReconstructionWriter:
         """Open ``folder`` for writing and put its manifest there with status ``running``.
 
         ``config`` is ``mvdyn_gtsam.config.to_dict(config)``; ``unit`` is "arbitrary" or "metric". With
-        ``resume`` an existing reconstruction of the same capture and configuration is continued (what
-        is there stays; a folder that does not exist yet is started). With ``overwrite`` an existing
-        reconstruction is removed first. Raises ResultError when the folder holds anything else.
+        ``resume`` an existing reconstruction of the same capture is continued (what is there stays, but not
+        the depth of a tracking that another ``config`` left unfinished; a folder that does not exist yet is
+        started); ``resuming.resumed`` says which ``config`` goes with what is finished. With ``overwrite``
+        an existing reconstruction is removed first. Raises ResultError when the folder holds anything else.
         """
         folder = Path(folder)
         refuse_unusable(folder, resume=resume, overwrite=overwrite)
         fresh = new_manifest(capture_info, config, unit)
         if resume and is_reconstruction(folder):
             manifest = read_manifest(folder)
-            _refuse_mismatch(folder, manifest, fresh)
+            _refuse_other_capture(folder, manifest, fresh)
+            _remove_outdated(folder, manifest, fresh)
             manifest.update(status=Status.RUNNING.value, config=fresh["config"], versions=fresh["versions"])
         else:
             if is_reconstruction(folder):
@@ -293,22 +295,34 @@ def refuse_unusable(folder: Path, *, resume: bool, overwrite: bool) -> None:
         )
 
 
-def _refuse_mismatch(folder: Path, manifest: Mapping[str, Any], fresh: Mapping[str, Any]) -> None:
+def _refuse_other_capture(folder: Path, manifest: Mapping[str, Any], fresh: Mapping[str, Any]) -> None:
     for key, value in fresh["capture"].items():
         if manifest["capture"].get(key) != value:
             raise ResultError(
                 f"{folder}: was made from another capture ({key} differs);"
                 " choose another --out or --overwrite"
             )
-    refined = any(stage["name"] == "refinement" for stage in manifest["stages"])
-    for section in sorted(set(fresh["config"]) | set(manifest["config"])):
-        if section == "refinement" and not refined:  # nothing on disk depends on it yet
-            continue
-        if manifest["config"].get(section) != fresh["config"].get(section):
-            raise ResultError(
-                f"{folder}: was made with another configuration (section {section!r});"
-                " resume with the same one, or --overwrite"
-            )
+
+
+def _remove_outdated(folder: Path, manifest: Mapping[str, Any], fresh: Mapping[str, Any]) -> None:
+    """Depth of an unfinished tracking is written once: none may stay that would be another now."""
+    if any(stage["name"] == "tracking" for stage in manifest["stages"]):
+        return
+    before, now = (
+        {section: values for section, values in one["config"].items() if section != "refinement"}
+        for one in (manifest, fresh)
+    )
+    if before == now:
+        return
+    try:
+        for name in ("depth", "confidence"):
+            if (folder / name).exists():
+                log.warning("%s: is measured again, with other settings", folder / name)
+                shutil.rmtree(folder / name)
+    except OSError as error:
+        raise ResultError(
+            f"{folder}: depth of other settings cannot be removed ({error.strerror})"
+        ) from error
 
 
 def remove_reconstruction(folder: Path) -> None:

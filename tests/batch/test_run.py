@@ -157,6 +157,13 @@ def test_a_result_of_another_configuration_is_not_taken_for_finished(
     unused = load_config(None, ["refinement.stride=4", "refinement.workers=2"])
     assert states(run_batch(folder, out, unused, settings)) == {"clip": "kept"}
     (folder / "clip" / "task.json").write_text('{"fails": "made with another configuration"}')
+    # Nor does a default that changed matter, or a setting that is new: nobody asked for either.
+    manifest = json.loads((out / "clip" / "manifest.json").read_text())
+    manifest["config"]["tracking"]["window"] = 30
+    del manifest["config"]["tracking"]["step_iterations"]
+    (out / "clip" / "manifest.json").write_text(json.dumps(manifest))
+    assert states(run_batch(folder, out, settings=settings)) == {"clip": "kept"}
+    assert json.loads((out / ".batch" / "config.json").read_text()) == {}
     other = load_config(None, ["tracking.window=20"])
     report = run_batch(folder, out, other, settings)
     assert states(report) == {"clip": "failed"} and "another configuration" in str(report.rows[0].problem)

@@ -39,7 +39,7 @@ def test_arguments_arrive_and_a_failed_clip_is_the_exit_code(
     rows = [Row("good", State.DONE, 2, 41, 1.0, 33.2, 512.0)]
 
     def stand_in(folder, out, config, settings, *, progress, on_row):  # type: ignore[no-untyped-def]
-        seen[:] = [folder, out, config.tracking.window, settings]
+        seen[:] = [folder, out, config, settings]
         for done, row in enumerate(rows):
             on_row(row)
             progress.update("batch", done + 1, len(rows), row.clip)
@@ -53,7 +53,7 @@ def test_arguments_arrive_and_a_failed_clip_is_the_exit_code(
     assert seen == [
         tmp_path / "clips",
         tmp_path / "out",
-        20,
+        {"tracking": {"window": 20}},
         BatchSettings("tracking", 2, 3, None, 1, 60.0, evaluate=False, skip_failed=True),
     ]
     assert code == 0 and "good" in out and "2 x 41" in out

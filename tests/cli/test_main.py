@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,10 @@ from mvdyn_gtsam.demo import demo_capture
 from mvdyn_gtsam.errors import ResultError, TrackingError
 from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.reconstruction import CaptureInfo, Reconstruction, ReconstructionWriter
+from mvdyn_gtsam.resuming import configure
 
 Pipeline = Callable[..., Reconstruction]
+Settings = Config | Mapping[str, Any]
 
 
 def true_poses(camera: str) -> np.ndarray:
@@ -35,12 +37,19 @@ def true_poses(camera: str) -> np.ndarray:
     return read_tum(demo_capture() / "groundtruth" / f"{camera}.txt")[1]
 
 
+def begin(capture: Capture, out: Path, config: Settings, resume: bool = False) -> ReconstructionWriter:
+    """As the pipeline does."""
+    run = configure(out, config, resume=resume)
+    run.log()
+    info = CaptureInfo.from_capture(capture)
+    return ReconstructionWriter.create(out, info, to_dict(run.config), resume=resume)
+
+
 def oracle(
-    capture: Capture, out: Path, config: Config, *, stage: str, resume: bool, progress: Progress
+    capture: Capture, out: Path, config: Settings, *, stage: str, resume: bool, progress: Progress
 ) -> Reconstruction:
     """Stands in for the pipeline: the true poses, and depth 2 everywhere in every tenth frame."""
-    info = CaptureInfo.from_capture(capture)
-    with ReconstructionWriter.create(out, info, to_dict(config), resume=resume) as writer:
+    with begin(capture, out, config, resume) as writer:
         writer.set_groups([[camera.name for camera in capture.cameras]])
         for camera in capture.cameras:
             writer.write_trajectory(camera.name, capture.timestamps, true_poses(camera.name))
@@ -53,13 +62,21 @@ def oracle(
 
 
 def failing(error: BaseException) -> Pipeline:
-    def pipeline(capture: Capture, out: Path, config: Config, *, resume: bool, **_: Any) -> Reconstruction:
-        info = CaptureInfo.from_capture(capture)
-        with ReconstructionWriter.create(out, info, to_dict(config), resume=resume) as writer:
+    def pipeline(capture: Capture, out: Path, config: Settings, *, resume: bool, **_: Any) -> Reconstruction:
+        with begin(capture, out, config, resume) as writer:
             writer.write_trajectory("cam0", capture.timestamps, true_poses("cam0"))
             raise error
 
     return pipeline
+
+
+def nothing(capture: Capture, out: Path, config: Settings, *, resume: bool, **_: Any) -> Reconstruction:
+    """Stands in for the pipeline: no pose at all."""
+    with begin(capture, out, config, resume) as writer:
+        for camera in capture.cameras:
+            none = np.full((capture.frame_count, 4, 4), np.nan)
+            writer.write_trajectory(camera.name, capture.timestamps, none)
+    return Reconstruction.load(out)
 
 
 @pytest.fixture
@@ -197,17 +214,61 @@ def test_reconstruct(
     assert "2 cameras x 41 frames, 512x384, 30 fps" in err
     assert "refinement 41/41 (100 %)" in err
     assert Reconstruction.load(out).manifest["config"]["tracking"]["window"] == 20
-    # Again: only with --resume (the same settings) or --overwrite.
+    # Again: only with --resume or --overwrite.
     code, _, err = run(capsys, "reconstruct", demo_capture(), "--out", out)
     assert code == 1 and "--resume" in only_line(err)
-    code, _, err = run(capsys, "reconstruct", demo_capture(), "--out", out, "--resume")
-    assert code == 1 and "section 'tracking'" in last_line(err)
-    assert (
-        run(capsys, "reconstruct", demo_capture(), "--out", out, "--resume", "--set", "tracking.window=20")[0]
-        == 0
-    )
     assert run(capsys, "reconstruct", demo_capture(), "--out", out, "--overwrite")[0] == 0
     assert Reconstruction.load(out).manifest["config"]["tracking"]["window"] == 25
+
+
+def test_resume_goes_on_with_the_settings_the_run_began_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], use_pipeline: Callable[[Pipeline], None]
+) -> None:
+    use_pipeline(oracle)
+    out = tmp_path / "o"
+    words = ["reconstruct", demo_capture(), "--out", out, "--stage", "tracking"]
+    assert run(capsys, *words, "--set", "tracking.window=40", "--set", "tracking.free=30")[0] == 0
+    manifest = json.loads((out / "manifest.json").read_text())
+    manifest["config"]["tracking"]["gone"] = 7
+    del manifest["config"]["tracking"]["step_iterations"]
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    before = (out / "manifest.json").read_bytes()
+
+    words += ["--resume"]
+    code, _, err = run(capsys, *words, "--set", "tracking.window=25")
+    assert code == 1 and (out / "manifest.json").read_bytes() == before
+    assert only_line(err) == (
+        f"mvdyn: {out}: what is finished was made with tracking.window=40, not 25; leave that out to go on,"
+        " or start anew with --overwrite"
+    )
+    # 30 of 40 frames, though 30 of the default's 25 would be refused
+    code, _, err = run(capsys, *words, "--set", "tracking.free=30", "--set", "refinement.stride=4")
+    assert code == 0
+    err = " ".join(err.split())
+    assert "settings that this version does not take are left out: tracking.gone=7 " in err
+    assert "not the defaults: tracking.window=40, tracking.free=30 " in err
+    made = Reconstruction.load(out).manifest["config"]
+    assert made == {**to_dict(Config()), "tracking": made["tracking"], "refinement": made["refinement"]}
+    assert (made["tracking"]["window"], made["tracking"]["free"], made["refinement"]["stride"]) == (40, 30, 4)
+    assert made["tracking"]["step_iterations"] == Config().tracking.step_iterations
+    code, _, err = run(capsys, *words, "--set", "tracking.windw=25")
+    assert code == 1 and "--set" in only_line(err) and "did you mean tracking.window?" in err
+
+
+def test_resume_cuts_cameras_as_the_run_did(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], use_pipeline: Callable[[Pipeline], None]
+) -> None:
+    for name, count in (("cam0", 4), ("cam1", 3)):
+        (tmp_path / name).mkdir()
+        for number in range(count):
+            cv2.imwrite(str(tmp_path / name / f"{number}.png"), np.full((32, 48, 3), 40 * number, np.uint8))
+    words: list[object] = ["reconstruct", "--fps", 10, "--out", tmp_path / "o", "--stage", "tracking"]
+    for name in ("cam0", "cam1"):
+        words += ["--camera", tmp_path / name / "*.png", "--intrinsics", "40,40,23.5,15.5"]
+    use_pipeline(nothing)
+    assert run(capsys, *words, "--truncate")[0] == 0
+    assert run(capsys, *words, "--resume")[0] == 0
+    assert Reconstruction.load(tmp_path / "o").frame_count == 3
 
 
 def test_reconstruct_from_videos(
@@ -247,8 +308,8 @@ def test_ctrl_c_says_where_the_partial_result_lies(
 def test_a_polite_kill_is_an_interruption(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], use_pipeline: Callable[[Pipeline], None]
 ) -> None:
-    def killed(capture: Capture, out: Path, config: Config, **_: Any) -> Reconstruction:
-        with ReconstructionWriter.create(out, CaptureInfo.from_capture(capture), to_dict(config)):
+    def killed(capture: Capture, out: Path, config: Settings, **_: Any) -> Reconstruction:
+        with begin(capture, out, config):
             os.kill(os.getpid(), signal.SIGTERM)
         raise AssertionError("the signal was ignored")
 

@@ -194,17 +194,42 @@ def test_resume_starts_where_there_is_nothing(tmp_path: Path) -> None:
     assert Reconstruction.load(tmp_path / "new").status == "complete"
 
 
-def test_resume_refuses_another_capture_and_another_configuration(tmp_path: Path) -> None:
+def test_resume_refuses_another_capture(tmp_path: Path) -> None:
     write_complete(tmp_path)
     other = dataclasses.replace(capture_info(), first_frame_crc32=(1, 3))
     with pytest.raises(ResultError, match="another capture"):
         ReconstructionWriter.create(tmp_path, other, CONFIG, resume=True)
-    with pytest.raises(ResultError, match="section 'tracking'"):
-        ReconstructionWriter.create(tmp_path, capture_info(), {"tracking": {"window": 9}}, resume=True)
-    allowed = {**CONFIG, "refinement": {"iterations": 3}}
-    with ReconstructionWriter.create(tmp_path, capture_info(), allowed, resume=True):
-        pass
-    assert Reconstruction.load(tmp_path).manifest["config"] == allowed
+
+
+def test_resume_keeps_finished_depth_and_notes_the_settings_of_what_comes(tmp_path: Path) -> None:
+    write_complete(tmp_path)
+    now = {"tracking": {"window": 25, "new": 1}, "refinement": {"iterations": 3}}
+    with ReconstructionWriter.create(tmp_path, capture_info(), now, resume=True) as writer:
+        assert writer.has_depth("cam0", 3)
+    assert Reconstruction.load(tmp_path).manifest["config"] == now
+
+
+@pytest.mark.parametrize(
+    ("now", "kept"),
+    [
+        ({**CONFIG, "refinement": {"iterations": 3}}, True),
+        ({**CONFIG, "tracking": {"window": 9}}, False),
+        ({**CONFIG, "graph": {"new": 1}}, False),
+    ],
+)
+def test_depth_of_an_unfinished_tracking_stays_only_with_its_settings(
+    tmp_path: Path, now: dict[str, Any], kept: bool
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        with ReconstructionWriter.create(tmp_path, capture_info(), CONFIG) as writer:
+            writer.write_depth("cam0", 0, np.ones((24, 32)), np.ones((24, 32)))
+            writer.write_arrays("start", {"a": np.ones(1)})
+            writer.finish_stage("start", 0.5)
+            raise KeyboardInterrupt
+    with ReconstructionWriter.create(tmp_path, capture_info(), now, resume=True) as writer:
+        assert writer.has_depth("cam0", 0) is kept
+        assert (tmp_path / "confidence").exists() is kept
+        assert writer.stage_finished("start") and writer.read_arrays("start")["a"] == 1.0
 
 
 def test_overwrite_removes_what_was_there(tmp_path: Path) -> None:
