@@ -118,12 +118,12 @@ def test_ground_truth_without_the_means_to_score_is_said_before_the_work(
     assert code == 1 and "scoring needs evo: pip install 'mvdyn_gtsam[eval]', or add --no-evaluate" in err
 
 
-@pytest.mark.slow
 def _heed_ctrl_c() -> None:
     """A job that a shell put into the background ignores Ctrl-C, and hands that down to its children."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+@pytest.mark.slow
 def test_two_captures_interrupted_by_ctrl_c_and_gone_on_with(tmp_path: Path) -> None:
     folder, out = tmp_path / "clips", tmp_path / "out"
     for cameras, frames in ((2, 10), (2, 11)):
