@@ -37,6 +37,12 @@ TEXTURED_SHARE = 0.1
 LEAST_VIEWS = 5
 """Other times that must see a pixel for it to be nowhere alike: it may be hidden in a few. Source: 1, 3 and 5
 compared on three rendered scenes and HoloLens: 5 find a sixth less of what moves and next to nothing else."""
+BETTER = 0.3
+"""By how much more alike the swept depth must look for it to replace one without trust. Source: choice."""
+DIFFERENT = 0.1
+"""Difference of two log depths from which a pixel can tell which is right. Source: choice."""
+RIM = 3
+"""Width of the rim that speaks for a plain region, px of the swept size. Source: choice, half a patch."""
 UNLIKE_SHARE = 0.5
 """Of a region whose gaps were closed that must be unlike itself. Source: choice."""
 NO_TRUST = 0.2
@@ -72,7 +78,9 @@ def told_by_other_times(context: Context, frame: Frame, first: FirstDepth) -> Fi
     """``first`` after the images of other times of the camera were asked.
 
     Failing regions that look alike there at the swept depth take it and fail no more; nor do bare ones, of
-    which flow cannot tell that they move. What looks alike at neither depth, and has no flow, fails too.
+    which flow cannot tell that they move. What looks alike at neither depth, and has no flow, fails too. The
+    swept depth also replaces one without trust where it looks clearly better, and within plain regions whose
+    rims say so.
     """
     config, size = context.config, first.theta.shape[::-1]
     views = [DenseView.of(view.camera, config.sweep.scale) for view in context.workspace.views]
@@ -81,28 +89,61 @@ def told_by_other_times(context: Context, frame: Frame, first: FirstDepth) -> Fi
         return first
     view, grey = views[frame[0]], _grey(context, frame, views[frame[0]])
     swept = context.image("swept", frame)
+    small_swept, small_first, trust = (
+        np.asarray(view.shrink(image), np.float32)
+        for image in (swept, np.exp(first.theta), trust_of(first.information))
+    )
     (alike_swept, views_swept), (alike_first, views_first) = (
-        median_likeness(grey, np.asarray(view.shrink(inverse_depth), np.float32), view.rays, others)
-        for inverse_depth in (swept, np.exp(first.theta))
+        median_likeness(grey, inverse_depth, view.rays, others)
+        for inverse_depth in (small_swept, small_first)
     )
-    textured = contrast(grey, PATCH) > TEXTURE
-    trust = np.asarray(view.shrink(trust_of(first.information)), np.float32)
+    textured, unsure = contrast(grey, PATCH) > TEXTURE, trust < NO_TRUST
     seen = np.minimum(views_swept, views_first) >= LEAST_VIEWS
-    alike = np.fmax(alike_swept, alike_first)
-    unlike = unlike_regions(alike, textured & (trust < NO_TRUST) & seen, config)
+    unlike = unlike_regions(np.fmax(alike_swept, alike_first), textured & unsure & seen, config)
+    differ = np.abs(np.log(small_swept / small_first)) > DIFFERENT
+    better = better_swept(alike_swept, alike_first, textured & unsure, differ, config)
+    plain = regions((~textured & unsure).astype(np.uint8), config)
+    inside = plain_inside(plain, better, textured & differ & ~better & (alike_first > config.match_likeness))
     alike_swept = cv2.resize(alike_swept, size, interpolation=cv2.INTER_NEAREST)
-    textured, unlike = (
+    textured, unlike, better, inside = (
         cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        for mask in (textured, unlike)
+        for mask in (textured, unlike, better, inside)
     )
+    theta = np.where(better | inside, np.log(swept), first.theta)
+    matched = np.float32(MATCHED_INFORMATION)
+    information = np.where(better, matched, first.information)
     found = static_regions(regions(first.fails, config), alike_swept, textured, config.match_likeness)
     sure = textured & (np.nan_to_num(alike_swept) > config.match_likeness)
-    information = np.where(sure, np.float32(MATCHED_INFORMATION), np.float32(0.0))
     return FirstDepth(
-        np.where(found.matched, np.log(swept), first.theta),
-        np.where(found.matched, information, first.information),
+        np.where(found.matched, np.log(swept), theta),
+        np.where(found.matched, np.where(sure, matched, np.float32(0.0)), information),
         (((first.fails > 0) & ~found.still) | unlike).astype(np.uint8),
     )
+
+
+def better_swept(
+    alike_swept: Float32, alike_first: Float32, telling: Mask, differ: Mask, config: RefinementConfig
+) -> Mask:
+    """``(h, w)`` where the swept depth looks alike and clearly better than the first.
+
+    Likenesses are of ``median_likeness``; ``telling (h, w)`` has texture and no flow to trust, ``differ
+    (h, w)`` two depths that are not the same.
+    """
+    gain = np.nan_to_num(alike_swept - alike_first)
+    return telling & differ & (np.nan_to_num(alike_swept) > config.match_likeness) & (gain > BETTER)
+
+
+def plain_inside(labels: Labels, better: Mask, worse: Mask) -> Mask:
+    """``(h, w)`` the plain regions of ``labels (h, w)``, numbered from 1, at whose rims ``better`` outnumbers
+    ``worse``: the depth of what is plain inside is that of its outline."""
+    inside = np.zeros(labels.shape, bool)
+    kernel = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
+    for label in range(1, int(labels.max(initial=0)) + 1):
+        region = labels == label
+        rim = (cv2.dilate(region.astype(np.uint8), kernel) > 0) & ~region
+        if (better & rim).sum() > (worse & rim).sum():
+            inside |= region
+    return inside
 
 
 def static_regions(labels: Labels, alike: Float32, textured: Mask, least_likeness: float) -> StaticRegions:

@@ -8,7 +8,9 @@ from mvdyn_gtsam.refinement.other_times import (
     PATCH,
     TEXTURE,
     StaticRegions,
+    better_swept,
     median_likeness,
+    plain_inside,
     static_regions,
     unlike_regions,
 )
@@ -87,3 +89,32 @@ def test_what_is_alike_at_no_depth_moves_unless_flow_explains_it() -> None:
     explained = ~(labels() == 2)
     assert not unlike_regions(alike, explained, config)[inner].any()
     assert not unlike_regions(np.full(SHAPE, np.nan, np.float32), np.ones(SHAPE, bool), config).any()
+
+
+def test_the_swept_depth_is_taken_where_it_looks_clearly_better_and_only_there() -> None:
+    grey, side = wall_and_side()
+    config, everywhere = RefinementConfig(), np.ones(SHAPE, bool)
+    right, _ = median_likeness(grey, at(WALL).reshape(SHAPE), VIEW.rays, [side])
+    wrong, _ = median_likeness(grey, at(2.0 * WALL).reshape(SHAPE), VIEW.rays, [side])
+    seen = np.isfinite(right) & np.isfinite(wrong)
+    assert better_swept(right, wrong, everywhere, everywhere, config)[seen].mean() > 0.8
+    for none in (
+        better_swept(wrong, right, everywhere, everywhere, config),
+        better_swept(right, right, everywhere, everywhere, config),
+        better_swept(right, wrong, ~everywhere, everywhere, config),
+        better_swept(right, wrong, everywhere, ~everywhere, config),
+        better_swept(np.full_like(right, np.nan), right, everywhere, everywhere, config),
+    ):
+        assert not none.any()
+
+
+def test_a_plain_region_follows_most_of_its_rim() -> None:
+    better, worse = (np.zeros(SHAPE, bool) for _ in range(2))
+    better[13:15, 15:35] = True
+    worse[45:47, 15:25] = True
+    # what lies far from a region's outline has no say in it
+    better[5:55, 0:5] = True
+    worse[13:15, 50:70] = True
+    assert (plain_inside(labels(), better, worse) == (labels() == 1)).all()
+    none = np.zeros(SHAPE, bool)
+    assert not plain_inside(labels(), none, none).any()

@@ -43,7 +43,8 @@ class EvenFlow:
 
 
 def read(camera: int, time: int) -> npt.NDArray[np.uint8]:
-    return np.random.default_rng(0).integers(0, 255, (*SHAPE, 3)).astype(np.uint8)
+    wall = np.random.default_rng(0).integers(0, 255, (*SHAPE, 3)).astype(np.uint8)
+    return np.roll(wall, -time, axis=1)
 
 
 def depth(camera: int, time: int) -> tuple[Float32, Float32]:
