@@ -44,8 +44,8 @@ DIFFERENT = 0.1
 RIM = 3
 """Width of the rim that speaks for a plain region, px of the swept size. Source: choice, half a patch."""
 RIM_SHARE = np.float32(0.05)
-"""Information of what its rim speaks for, of that of a pixel that speaks for itself. Source: 0 to 0.5 compared
-on HoloLens, to 0.05 on multicamvideo: with none, fills leaned to what is behind; with half, noise stayed."""
+"""Information of what its rim speaks for, of that of a pixel that speaks for itself. Source: shares to 0.5
+compared on HoloLens, to 0.05 on multicamvideo: none let fills lean to what is behind, half kept noise."""
 UNLIKE_SHARE = 0.5
 """Of a region whose gaps were closed that must be unlike itself. Source: choice."""
 NO_TRUST = 0.2
