@@ -202,7 +202,9 @@ class VideoStream(MediaStream):
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         log_level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
         try:
-            video = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+            # A file read that took long is no error: the process was suspended, by Ctrl-Z for one.
+            patient = [cv2.CAP_PROP_READ_TIMEOUT_MSEC, np.iinfo(np.int32).max]
+            video = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG, patient)
         finally:
             cv2.utils.logging.setLogLevel(log_level)
         if not video.isOpened():

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import multiprocessing
 import pickle
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import cv2
@@ -151,6 +153,26 @@ def test_forked_process_opens_its_own_decoder(video: Path) -> None:
     finally:
         process.kill()
     assert frame_number(stream.read(6)) == 6
+
+
+@pytest.mark.slow
+def test_a_suspended_process_goes_on(video: Path) -> None:
+    program = (
+        "import sys, time; from pathlib import Path; from mvdyn_gtsam.capture.streams import VideoStream\n"
+        "stream = VideoStream(Path(sys.argv[1])); print('reads', flush=True)\n"
+        "while time.process_time() < 5.0:\n"
+        "    for number in range(len(stream)): stream.read(number)\n"
+    )
+    command = [sys.executable, "-c", program, str(video)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert process.stdout.readline() == "reads\n"
+        sleep(0.5)
+        process.send_signal(signal.SIGSTOP)
+        # OpenCV gives a read up after 30 s
+        sleep(31.0)
+        process.send_signal(signal.SIGCONT)
+        assert process.wait() == 0, process.stderr.read()
 
 
 def test_truncated_video_without_index(tmp_path: Path, video: Path) -> None:
