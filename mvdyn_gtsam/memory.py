@@ -11,8 +11,8 @@ M_MMAP_THRESHOLD = -3
 KEPT_BYTES = 64 * 2**20
 """Freed memory that each arena keeps at most."""
 LARGEST_KEPT_BYTES = 2 * 2**20
-"""Blocks above it are returned at once. With 32 MiB, the most glibc allows, the peak grew by 94 MB from 150 to
-300 frames of robodog_overlap, with 2 by 40 (experiments.scaling)."""
+"""Blocks above it are returned at once. With 32 MiB, the most glibc allows, the peak grew by 94 MB from 150
+to 300 frames of robodog_overlap, with 2 by 40 (experiments.scaling)."""
 
 
 def keep_freed_memory() -> bool:
