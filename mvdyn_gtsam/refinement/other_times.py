@@ -77,6 +77,22 @@ class StaticRegions:
     """``(h, w)`` of those which look alike at the swept depth; the others are bare."""
 
 
+@dataclass(frozen=True)
+class Testimony:
+    """What images of other times say of each pixel of a frame, all ``(h, w)``."""
+
+    alike: Float32
+    """How alike they are at the swept depth; NaN where none sees it."""
+    textured: Mask
+    """Where that tells anything."""
+    unlike: Mask
+    """Alike neither at the swept nor at the first depth, and no flow to trust."""
+    better: Mask
+    """Clearly more alike at the swept than at the first depth, and no flow to trust."""
+    inside: Mask
+    """Within a plain region on whose rim most is ``better``."""
+
+
 def told_by_other_times(context: Context, frame: Frame, first: FirstDepth) -> FirstDepth:
     """``first`` after the images of other times of the camera were asked.
 
@@ -85,56 +101,60 @@ def told_by_other_times(context: Context, frame: Frame, first: FirstDepth) -> Fi
     swept depth also replaces one without trust where it looks clearly better, and within plain regions whose
     rims say so.
     """
-    config, size = context.config, first.theta.shape[::-1]
-    views = [DenseView.of(view.camera, config.sweep.scale) for view in context.workspace.views]
-    others = _other_times(context, frame, views[frame[0]])
-    if not others:
+    said = _testimony(context, frame, first)
+    if said is None:
         return first
-    view, grey = views[frame[0]], _grey(context, frame, views[frame[0]])
-    swept = context.image("swept", frame)
-    small_swept, small_first, trust = (
+    config, swept = context.config, np.log(context.image("swept", frame))
+    matched = np.float32(MATCHED_INFORMATION)
+    theta = np.where(said.better | said.inside, swept, first.theta)
+    by_rim = np.where(said.inside, np.maximum(first.information, RIM_SHARE * matched), first.information)
+    information = np.where(said.better, matched, by_rim)
+    found = static_regions(regions(first.fails, config), said.alike, said.textured, config.match_likeness)
+    sure = said.textured & (np.nan_to_num(said.alike) > config.match_likeness)
+    return FirstDepth(
+        np.where(found.matched, swept, theta),
+        np.where(found.matched, np.where(sure, matched, np.float32(0.0)), information),
+        (((first.fails > 0) & ~found.still) | said.unlike).astype(np.uint8),
+    )
+
+
+def _testimony(context: Context, frame: Frame, first: FirstDepth) -> Testimony | None:
+    """At the swept size, brought up to that of ``first``; None where no other time shares the view."""
+    config, size = context.config, first.theta.shape[::-1]
+    view = DenseView.of(context.workspace.views[frame[0]].camera, config.sweep.scale)
+    others = _other_times(context, frame, view)
+    if not others:
+        return None
+    grey = _grey(context, frame, view)
+    swept, at_first, trust = (
         np.asarray(view.shrink(image), np.float32)
-        for image in (swept, np.exp(first.theta), trust_of(first.information))
+        for image in (context.image("swept", frame), np.exp(first.theta), trust_of(first.information))
     )
-    (alike_swept, views_swept), (alike_first, views_first) = (
-        median_likeness(grey, inverse_depth, view.rays, others)
-        for inverse_depth in (small_swept, small_first)
-    )
+    alike, views = median_likeness(grey, swept, view.rays, others)
+    alike_first, views_first = median_likeness(grey, at_first, view.rays, others)
     textured, unsure = contrast(grey, PATCH) > TEXTURE, trust < NO_TRUST
-    seen = np.minimum(views_swept, views_first) >= LEAST_VIEWS
-    unlike = unlike_regions(np.fmax(alike_swept, alike_first), textured & unsure & seen, config)
-    differ = np.abs(np.log(small_swept / small_first)) > DIFFERENT
-    better = better_swept(alike_swept, alike_first, textured & unsure, differ, config)
-    plain = regions((~textured & unsure).astype(np.uint8), config)
-    inside = plain_inside(plain, better, textured & differ & ~better & (alike_first > config.match_likeness))
-    alike_swept = cv2.resize(alike_swept, size, interpolation=cv2.INTER_NEAREST)
-    textured, unlike, better, inside = (
+    seen = np.minimum(views, views_first) >= LEAST_VIEWS
+    unlike = unlike_regions(np.fmax(alike, alike_first), textured & unsure & seen, config)
+    differ = np.abs(np.log(swept / at_first)) > DIFFERENT
+    better = better_swept(alike, alike_first, textured & unsure & differ, config)
+    worse = textured & differ & ~better & (np.nan_to_num(alike_first) > config.match_likeness)
+    inside = plain_inside(regions((~textured & unsure).astype(np.uint8), config), better, worse)
+    masks = (
         cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         for mask in (textured, unlike, better, inside)
     )
-    theta = np.where(better | inside, np.log(swept), first.theta)
-    matched = np.float32(MATCHED_INFORMATION)
-    by_rim = np.maximum(first.information, RIM_SHARE * matched)
-    information = np.where(better, matched, np.where(inside, by_rim, first.information))
-    found = static_regions(regions(first.fails, config), alike_swept, textured, config.match_likeness)
-    sure = textured & (np.nan_to_num(alike_swept) > config.match_likeness)
-    return FirstDepth(
-        np.where(found.matched, np.log(swept), theta),
-        np.where(found.matched, np.where(sure, matched, np.float32(0.0)), information),
-        (((first.fails > 0) & ~found.still) | unlike).astype(np.uint8),
-    )
+    enlarged = cv2.resize(alike, size, interpolation=cv2.INTER_NEAREST)
+    return Testimony(np.asarray(enlarged, np.float32), *masks)
 
 
-def better_swept(
-    alike_swept: Float32, alike_first: Float32, telling: Mask, differ: Mask, config: RefinementConfig
-) -> Mask:
+def better_swept(alike_swept: Float32, alike_first: Float32, telling: Mask, config: RefinementConfig) -> Mask:
     """``(h, w)`` where the swept depth looks alike and clearly better than the first.
 
-    Likenesses are of ``median_likeness``; ``telling (h, w)`` has texture and no flow to trust, ``differ
-    (h, w)`` two depths that are not the same.
+    Likenesses are of ``median_likeness``; ``telling (h, w)`` has texture, no flow to trust, and two depths
+    that are not the same.
     """
     gain = np.nan_to_num(alike_swept - alike_first)
-    return telling & differ & (np.nan_to_num(alike_swept) > config.match_likeness) & (gain > BETTER)
+    return telling & (np.nan_to_num(alike_swept) > config.match_likeness) & (gain > BETTER)
 
 
 def plain_inside(labels: Labels, better: Mask, worse: Mask) -> Mask:

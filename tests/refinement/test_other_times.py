@@ -97,13 +97,12 @@ def test_the_swept_depth_is_taken_where_it_looks_clearly_better_and_only_there()
     right, _ = median_likeness(grey, at(WALL).reshape(SHAPE), VIEW.rays, [side])
     wrong, _ = median_likeness(grey, at(2.0 * WALL).reshape(SHAPE), VIEW.rays, [side])
     seen = np.isfinite(right) & np.isfinite(wrong)
-    assert better_swept(right, wrong, everywhere, everywhere, config)[seen].mean() > 0.8
+    assert better_swept(right, wrong, everywhere, config)[seen].mean() > 0.8
     for none in (
-        better_swept(wrong, right, everywhere, everywhere, config),
-        better_swept(right, right, everywhere, everywhere, config),
-        better_swept(right, wrong, ~everywhere, everywhere, config),
-        better_swept(right, wrong, everywhere, ~everywhere, config),
-        better_swept(np.full_like(right, np.nan), right, everywhere, everywhere, config),
+        better_swept(wrong, right, everywhere, config),
+        better_swept(right, right, everywhere, config),
+        better_swept(right, wrong, ~everywhere, config),
+        better_swept(np.full_like(right, np.nan), right, everywhere, config),
     ):
         assert not none.any()
 
