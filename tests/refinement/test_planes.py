@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -104,6 +105,18 @@ def test_planes_of_one_frame_are_one_witness() -> None:
     asked = np.concatenate([frames, [19]])
     planes = np.concatenate([planes, SIDE[None]])
     assert agreed_plane(region, planes, np.ones(21), asked, config) is None
+
+
+def test_of_very_many_planes_some_are_compared() -> None:
+    (region,) = regions_of()
+    planes = np.concatenate([np.tile(CEILING, (1500, 1)), np.tile(BACK, (500, 1))])
+    tracemalloc.start()
+    chosen = agreed_plane(region, planes, np.ones(2000), np.arange(2000), CONFIG)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert chosen is not None
+    np.testing.assert_allclose(chosen.plane, CEILING)
+    assert peak < 50e6
 
 
 def test_a_plane_counts_less_far_from_its_rim() -> None:
