@@ -38,8 +38,8 @@ WELL_SEEN = 0.5
 JUDGED_PIXELS = 60
 """Pixels of a region at which planes are compared."""
 JUDGED_PLANES = 500
-"""Planes compared for a region, drawn at random beyond: with all, 40 frames of panoptic_basketball_6cam, where
-thousands fit, took 4 s each, with 1000 0.2 s. On hololens_office_2seg 322 fit at most."""
+"""Planes compared for a region, drawn at random beyond: with all, 40 frames of panoptic_basketball_6cam took
+4 s each, where thousands fit, with 1000 0.2 s. On hololens_office_2seg 322 fit at most."""
 MAJORITY = 0.5
 """Of the planes that fit a region's rim, those that must agree on its depth."""
 HALF_KNOWN_SIGMA = 0.1
