@@ -81,7 +81,7 @@ def resumed(saved: Mapping[str, Any], finished: Collection[str], asked: Mapping[
         config = config_from_dict(nest(wanted))
     except ConfigError as error:
         raise ResultError(
-            f"with the settings it began with, {error}; change one with --set, or start anew with --overwrite"
+            f"with the settings it began with, {error}; change one by --set, or start anew in another folder"
         ) from error
     changed = {key for key in {*recorded, *wanted} if key not in recorded or recorded[key] != wanted.get(key)}
     return RunConfig(
@@ -103,7 +103,7 @@ def _refuse_other(began: Mapping[str, Any], wanted: Mapping[str, Any], finished:
         what = ", ".join(f"{key}={_plain(began[key])}, not {_plain(wanted[key])}" for key in other)
         raise ResultError(
             f"what is finished was made with {what}; leave {'that' if len(other) == 1 else 'these'} out to go"
-            " on, or start anew with --overwrite"
+            " on, or start anew in another folder"
         )
 
 

@@ -97,7 +97,7 @@ def test_what_is_asked_for_is_refused_from_the_stage_on_that_used_it(
             resumed(saved(), finished, asked)
         assert str(caught.value) == (
             f"what is finished was made with {key}={default}, not {value}; leave that out to go on, or start"
-            " anew with --overwrite"
+            " anew in another folder"
         )
 
 
@@ -130,7 +130,7 @@ def test_every_section_belongs_to_a_stage() -> None:
 
 
 def test_values_that_do_not_go_together_are_refused() -> None:
-    with pytest.raises(ResultError, match=r"tracking\.free is 10; it must be between 1 .*--overwrite"):
+    with pytest.raises(ResultError, match=r"tracking\.free is 10; it must be between 1 .*another folder"):
         resumed(saved(), ("start",), {"tracking": {"window": 5}})
 
 

@@ -113,7 +113,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise ResultError(f"{path}: cannot be read ({error}); reconstruct again with --overwrite") from error
+        raise ResultError(
+            f"{path}: cannot be read ({error}); remove its folder, or reconstruct again with --overwrite"
+        ) from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ResultError(f'{path}: not the manifest of a reconstruction ("format" is not "{FORMAT}")')
     if manifest.get("schema") != SCHEMA:
@@ -123,7 +125,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         )
     problem = _layout_problem(manifest)
     if problem:
-        raise ResultError(f"{path}: {problem}; reconstruct again with --overwrite")
+        raise ResultError(f"{path}: {problem}; remove its folder, or reconstruct again with --overwrite")
     return manifest
 
 

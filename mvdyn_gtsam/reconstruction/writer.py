@@ -219,7 +219,10 @@ class ReconstructionWriter:
         """
         path = arrays_path(self.folder, name)
         if not path.is_file():
-            raise ResultError(f"{path}: is missing, and the next stage needs it; start anew with --overwrite")
+            raise ResultError(
+                f"{path}: is missing, and the next stage needs it; remove {self.folder}, or start anew with"
+                " --overwrite"
+            )
         with np.load(path, allow_pickle=False) as arrays:
             return dict(arrays)
 

@@ -239,7 +239,7 @@ def test_resume_goes_on_with_the_settings_the_run_began_with(
     assert code == 1 and (out / "manifest.json").read_bytes() == before
     assert only_line(err) == (
         f"mvdyn: {out}: what is finished was made with tracking.window=40, not 25; leave that out to go on,"
-        " or start anew with --overwrite"
+        " or start anew in another folder"
     )
     # 30 of 40 frames, though 30 of the default's 25 would be refused
     code, _, err = run(capsys, *words, "--set", "tracking.free=30", "--set", "refinement.stride=4")
