@@ -163,8 +163,10 @@ def settle_task(context: Context, frame: Frame) -> None:
     else:
         # a camera that stands still has no parallax of its own: the others' flow will tell
         theta = np.log(context.image("aligned", frame))
+    weight = np.maximum(trust, 1e-3) / np.float32(config.prior_sigma**2)
+    held = (np.asarray(workspace.read("held", frame)) > 0) & ~around
     workspace.write("prior", frame, theta)
-    workspace.write("prior_weight", frame, np.maximum(trust, 1e-3) / np.float32(config.prior_sigma**2))
+    workspace.write("prior_weight", frame, np.where(held, np.maximum(weight, config.held_sigma**-2), weight))
     workspace.write(LABELS, frame, labels.astype(np.uint8))
 
 

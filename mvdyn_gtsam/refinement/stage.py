@@ -39,8 +39,8 @@ Array = npt.NDArray[np.float64]
 
 BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
-BYTES_PER_PIXEL = 50.0
-"""Of a view on disk besides its flow: twelve arrays of 32 bits and two of 8."""
+BYTES_PER_PIXEL = 58.0
+"""Of a view on disk besides its flow: thirteen arrays of 32 bits and six of 8."""
 FAILS, CARRIED = "fails", "carried"
 """The arrays of where the static model fails that ``carry`` reads and writes in turn."""
 CARRY_ROUNDS = 4
@@ -192,7 +192,7 @@ class Refinement:
         workspace, tracked = self._workspace, self._tracked
         workspace.create("grey", np.uint8, full_size=True)
         workspace.create("moving", np.uint8)
-        for name in (FAILS, CARRIED, "stands"):
+        for name in (FAILS, CARRIED, "stands", "held"):
             workspace.create(name, np.uint8)
         workspace.create(LABELS, np.uint8)
         for name in (

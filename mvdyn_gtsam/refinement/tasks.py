@@ -98,10 +98,12 @@ def begin_task(context: Context, frame: Frame) -> None:
         np.log(chosen), FrameProblem(edges, {}, weights, weak, config), FIRST_STEPS
     )
     fails = failing_regions(static_residual(np.exp(theta), edges), config)
-    first = told_by_other_times(context, frame, FirstDepth(theta, information, fails))
+    first = FirstDepth(theta, information, fails, np.zeros_like(fails))
+    first = told_by_other_times(context, frame, first)
     workspace.write("first", frame, first.theta)
     workspace.write("information", frame, first.information)
     workspace.write("fails", frame, first.fails)
+    workspace.write("held", frame, first.held)
 
 
 def window_task(context: Context, window: tuple[str, str, int, int, int]) -> None:

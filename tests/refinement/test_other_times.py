@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from mvdyn_gtsam.refinement.other_times import (
+    AROUND,
+    LIKELIER,
     PATCH,
     TEXTURE,
     StaticRegions,
     better_swept,
+    likelier_around,
     median_likeness,
     plain_inside,
     static_regions,
@@ -105,6 +108,20 @@ def test_the_swept_depth_is_taken_where_it_looks_clearly_better_and_only_there()
         better_swept(np.full_like(right, np.nan), right, everywhere, config),
     ):
         assert not none.any()
+
+
+def test_plain_pixels_judge_together_what_each_alone_cannot() -> None:
+    noise = np.random.default_rng(0).standard_normal((2, *SHAPE)).astype(np.float32)
+    left = np.zeros(SHAPE, bool)
+    left[:, :45] = True
+    # of a single pixel the noise is five times the difference
+    swept = 0.3 + np.where(left, 2.0, 0.0) * LIKELIER + 10.0 * LIKELIER * noise[0]
+    swept, first = swept.astype(np.float32), np.full(SHAPE, 0.3, np.float32)
+    found = likelier_around(swept, first, np.ones(SHAPE, bool))
+    inner = slice(AROUND // 2, -AROUND // 2)
+    assert found[inner, : 45 - AROUND].mean() > 0.7 and found[inner, 45 + AROUND :].mean() < 0.3
+    assert not likelier_around(swept, first, ~left)[left].any()
+    assert not likelier_around(np.full_like(swept, np.nan), first, np.ones(SHAPE, bool)).any()
 
 
 def test_a_plain_region_follows_most_of_its_rim() -> None:
