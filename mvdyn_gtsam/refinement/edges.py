@@ -60,12 +60,12 @@ class Edge:
 
     def without(self, excluded: npt.NDArray[np.bool_]) -> Edge:
         """The edge without the pixels of view i that ``excluded (N,)`` marks."""
-        kept = ~excluded[self.pixels]
+        kept = np.flatnonzero(~excluded[self.pixels])
         return replace(
             self,
             pixels=self.pixels[kept],
-            rays=self.rays[kept],
-            target=self.target[kept],
+            rays=np.take(self.rays, kept, axis=0),
+            target=np.take(self.target, kept, axis=0),
             weight=self.weight[kept],
             nearest=self.nearest[kept],
         )
@@ -91,13 +91,13 @@ def load_edges(
             continue
         measured = workspace.read_flow(*ends, backward=not first, among=among, least=LEAST_WEIGHT)
         view_i, view_j, pixels = workspace.views[i[0]], workspace.views[j[0]], measured.pixels
-        small = raster[pixels] + measured.flow
+        small = np.take(raster, pixels, axis=0) + measured.flow
         edges.append(
             Edge(
                 i=i,
                 j=j,
                 pixels=pixels,
-                rays=view_i.rays[pixels],
+                rays=np.take(view_i.rays, pixels, axis=0),
                 target=_in_full_pixels(small, view_j),
                 weight=measured.weight,
                 nearest=_nearest(small, view_j.shape),
