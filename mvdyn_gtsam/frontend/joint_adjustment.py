@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -21,6 +22,7 @@ from mvdyn_gtsam.frontend.features import Features
 from mvdyn_gtsam.frontend.rig import Pair, RigConfig, add_mounts, likely_mounts, solved_mounts
 from mvdyn_gtsam.frontend.single_camera import CameraMap
 from mvdyn_gtsam.frontend.start import StartFrame
+from mvdyn_gtsam.frontend.threads import in_order
 from mvdyn_gtsam.geometry import Similarity, invert_pose, project, transform_points
 
 Array = npt.NDArray[np.float64]
@@ -120,26 +122,46 @@ def _search(
 ) -> Observations:
     """Also the keypoints that look like a landmark and lie within ``radius`` of its projection."""
     descriptor = _descriptors(maps, observations)
-    added = [
-        np.column_stack([observations.landmark, observations.camera, observations.frame, observations.pixel])
-    ]
-    for (camera, frame), pose in wTc.items():
-        here = (observations.camera == camera) & (observations.frame == frame)
-        unseen = np.ones(len(observations.points), bool)
-        unseen[observations.landmark[here]] = False
-        features = maps[camera].features[frame]
-        # Keypoints that already are a landmark's stay its own.
-        free = np.ones(len(features.pixels), bool)
-        free[cKDTree(features.pixels).query(observations.pixel[here])[1]] = False
-        candidates, pixels = _visible(cameras[camera], pose, observations.points, np.flatnonzero(unseen))
-        landmark, keypoint = _look_near(
-            descriptor[candidates], pixels, features, np.flatnonzero(free), radius, similarity
+    known = np.column_stack(
+        [observations.landmark, observations.camera, observations.frame, observations.pixel]
+    )
+    jobs = [
+        partial(
+            _found_in, label, cameras[label[0]], maps[label[0]], pose, observations, descriptor, radius,
+            similarity,
         )
-        label = np.broadcast_to([camera, frame], (len(landmark), 2))
-        added.append(np.column_stack([candidates[landmark], label, features.pixels[keypoint]]))
+        for label, pose in wTc.items()
+    ]  # fmt: skip
+    added = [known, *in_order(jobs)]
     table = np.concatenate(added)
     columns = table[:, :3].astype(np.int64)
     return Observations(columns[:, 0], columns[:, 1], columns[:, 2], table[:, 3:5], observations.points)
+
+
+def _found_in(
+    label: Label,
+    camera: Camera,
+    camera_map: CameraMap,
+    wTc: Array,
+    observations: Observations,
+    descriptor: npt.NDArray[np.float32],
+    radius: float,
+    similarity: float,
+) -> Array:
+    """Rows ``(M, 5)`` of landmark, camera, frame and pixel: what ``_search`` finds in one frame."""
+    here = (observations.camera == label[0]) & (observations.frame == label[1])
+    unseen = np.ones(len(observations.points), bool)
+    unseen[observations.landmark[here]] = False
+    features = camera_map.features[label[1]]
+    # Keypoints that already are a landmark's stay its own.
+    free = np.ones(len(features.pixels), bool)
+    free[cKDTree(features.pixels).query(observations.pixel[here])[1]] = False
+    candidates, pixels = _visible(camera, wTc, observations.points, np.flatnonzero(unseen))
+    landmark, keypoint = _look_near(
+        descriptor[candidates], pixels, features, np.flatnonzero(free), radius, similarity
+    )
+    labels = np.broadcast_to(label, (len(landmark), 2))
+    return np.column_stack([candidates[landmark], labels, features.pixels[keypoint]])
 
 
 def _descriptors(maps: Sequence[CameraMap], observations: Observations) -> npt.NDArray[np.float32]:
@@ -183,7 +205,9 @@ def _look_near(
         cKDTree(features.pixels[free]), radius, output_type="coo_matrix"
     )
     row, column = near.row.astype(np.int64), near.col.astype(np.int64)
-    look = (descriptor[row] * features.descriptors[free[column]]).sum(1)
+    look = np.take(descriptor, row, axis=0)
+    look *= np.take(features.descriptors, free[column], axis=0)
+    look = look.sum(1)
     good = look > similarity
     row, column, look = row[good], column[good], look[good]
     order = np.argsort(-look, kind="stable")
