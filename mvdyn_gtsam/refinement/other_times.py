@@ -164,6 +164,8 @@ def _testimony(context: Context, frame: Frame, first: FirstDepth) -> Testimony |
     better = better_swept(alike, alike_first, textured & unsure & differ, config)
     worse = textured & differ & ~better & (np.nan_to_num(alike_first) > config.match_likeness)
     likelier = ~textured & likelier_around(alike, alike_first, unsure & differ)
+    # specks are noise
+    likelier = regions(likelier.astype(np.uint8), config) > 0
     inside = plain_inside(regions((~textured & unsure).astype(np.uint8), config), better, worse)
     masks = (
         cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
