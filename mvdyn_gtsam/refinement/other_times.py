@@ -163,7 +163,8 @@ def _testimony(context: Context, frame: Frame, first: FirstDepth) -> Testimony |
     differ = np.abs(np.log(swept / at_first)) > DIFFERENT
     better = better_swept(alike, alike_first, textured & unsure & differ, config)
     worse = textured & differ & ~better & (np.nan_to_num(alike_first) > config.match_likeness)
-    likelier = ~textured & likelier_around(alike, alike_first, unsure & differ)
+    # no textured pixels: they speak for what they lie on, which is often the outline of something plain
+    likelier = likelier_around(alike, alike_first, ~textured & unsure & differ)
     # specks are noise
     likelier = regions(likelier.astype(np.uint8), config) > 0
     inside = plain_inside(regions((~textured & unsure).astype(np.uint8), config), better, worse)
