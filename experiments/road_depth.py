@@ -34,10 +34,10 @@ def lane_depth(
 ) -> npt.NDArray[np.float64]:
     """Depth ``(H, W)`` m of the lane before a level camera ``height`` m above the road; NaN elsewhere."""
     rows, cols = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         depth = height * intrinsics[1, 1] / (rows - intrinsics[1, 2])
-    aside = (cols - intrinsics[0, 2]) / intrinsics[0, 0] * depth
-    lane = (depth > 0.0) & (depth <= FARTHEST) & (np.abs(aside) <= HALF_WIDTH)
+        aside = (cols - intrinsics[0, 2]) / intrinsics[0, 0] * depth
+        lane = (depth > 0.0) & (depth <= FARTHEST) & (np.abs(aside) <= HALF_WIDTH)
     return np.where(lane, depth, np.nan)
 
 
