@@ -155,16 +155,17 @@ def _testimony(context: Context, frame: Frame, first: FirstDepth) -> Testimony |
         np.asarray(view.shrink(image), np.float32)
         for image in (context.image("swept", frame), np.exp(first.theta), trust_of(first.information))
     )
-    alike, views = median_likeness(grey, swept, view.rays, others)
-    alike_first, views_first = median_likeness(grey, at_first, view.rays, others)
+    by_view, by_view_first = (likenesses(grey, depth, view.rays, others) for depth in (swept, at_first))
+    alike, alike_first = known_median(by_view), known_median(by_view_first)
     textured, unsure = contrast(grey, PATCH) > TEXTURE, trust < NO_TRUST
+    views, views_first = (np.isfinite(table).sum(axis=0) for table in (by_view, by_view_first))
     seen = np.minimum(views, views_first) >= LEAST_VIEWS
     unlike = unlike_regions(np.fmax(alike, alike_first), textured & unsure & seen, config)
     differ = np.abs(np.log(swept / at_first)) > DIFFERENT
     better = better_swept(alike, alike_first, textured & unsure & differ, config)
     worse = textured & differ & ~better & (np.nan_to_num(alike_first) > config.match_likeness)
     # no textured pixels: they speak for what they lie on, which is often the outline of something plain
-    likelier = likelier_around(alike, alike_first, ~textured & unsure & differ)
+    likelier = likelier_around(by_view - by_view_first, ~textured & unsure & differ)
     # specks are noise
     likelier = regions(likelier.astype(np.uint8), config) > 0
     inside = plain_inside(regions((~textured & unsure).astype(np.uint8), config), better, worse)
@@ -179,21 +180,25 @@ def _testimony(context: Context, frame: Frame, first: FirstDepth) -> Testimony |
 def better_swept(alike_swept: Float32, alike_first: Float32, telling: Mask, config: RefinementConfig) -> Mask:
     """``(h, w)`` where the swept depth looks alike and clearly better than the first.
 
-    Likenesses are of ``median_likeness``; ``telling (h, w)`` has texture, no flow to trust, and two depths
+    Likenesses are medians of ``likenesses``; ``telling (h, w)`` has texture, no flow to trust, and two depths
     that are not the same.
     """
     gain = np.nan_to_num(alike_swept - alike_first)
     return telling & (np.nan_to_num(alike_swept) > config.match_likeness) & (gain > BETTER)
 
 
-def likelier_around(alike_swept: Float32, alike_first: Float32, telling: Mask) -> Mask:
+def likelier_around(gain: Float32, telling: Mask) -> Mask:
     """``(h, w)`` where the pixels ``telling (h, w)`` around look more alike at the swept than at the first
-    depth, in their mean; of those alone. Likenesses are of ``median_likeness``."""
-    gain = alike_swept - alike_first
-    told = telling & np.isfinite(gain)
-    count = cv2.blur(told.astype(np.float32), (AROUND, AROUND))
-    total = cv2.blur(np.where(told, gain, np.float32(0.0)), (AROUND, AROUND))
-    return told & (total > LIKELIER * count)
+    depth, in their mean; of those alone.
+
+    ``gain (K, h, w)`` is the difference by view, NaN where it does not see the pixel at both depths: at the
+    rim of an image one depth may be seen by other views than the other.
+    """
+    both = np.isfinite(gain) & telling
+    # pixels that few views see count less
+    count = cv2.blur(both.sum(axis=0, dtype=np.float32), (AROUND, AROUND))
+    total = cv2.blur(np.where(both, gain, np.float32(0.0)).sum(axis=0), (AROUND, AROUND))
+    return both.any(axis=0) & (total > LIKELIER * count)
 
 
 def plain_inside(labels: Labels, better: Mask, worse: Mask) -> Mask:
@@ -212,8 +217,9 @@ def plain_inside(labels: Labels, better: Mask, worse: Mask) -> Mask:
 def static_regions(labels: Labels, alike: Float32, textured: Mask, least_likeness: float) -> StaticRegions:
     """Which regions of ``labels (h, w)``, numbered from 1, stand still.
 
-    ``alike (h, w)`` is of ``median_likeness`` at the swept depth. A region stands still where most of its
-    ``textured (h, w)`` pixels that other times see are alike by ``least_likeness``, and where it has none.
+    ``alike (h, w)`` is the median of ``likenesses`` at the swept depth. A region stands still where most of
+    its ``textured (h, w)`` pixels that other times see are alike by ``least_likeness``, and where it has
+    none.
     """
     telling = textured & np.isfinite(alike)
     still, matched = (np.zeros(labels.shape, bool) for _ in range(2))
@@ -241,19 +247,18 @@ def unlike_regions(alike: Float32, telling: Mask, config: RefinementConfig) -> M
     return found
 
 
-def median_likeness(
+def likenesses(
     grey: Float32, inverse_depth: Float32, rays: Float32, others: Sequence[PictureView]
-) -> tuple[Float32, npt.NDArray[np.int64]]:
-    """Correlation ``(h, w)`` of an image's patches with those of ``others`` at ``inverse_depth (h, w)``.
+) -> Float32:
+    """Correlation ``(K, h, w)`` of an image's patches with those of ``others`` at ``inverse_depth (h, w)``.
 
-    The median over the views that see a pixel, NaN where none does; and how many do, ``(h, w)``. ``rays (h w,
-    3)`` are those of the pixels of ``grey (h, w)``.
+    NaN where a view does not see the pixel. ``rays (h w, 3)`` are those of the pixels of ``grey (h, w)``.
     """
     table = np.full((len(others), *grey.shape), np.nan, np.float32)
     for row, view in zip(table, others, strict=True):
         alike, seen = likeness(grey, inverse_depth.ravel(), rays, view, PATCH)
         row[seen] = alike[seen]
-    return known_median(table), np.isfinite(table).sum(axis=0)
+    return table
 
 
 def _other_times(context: Context, frame: Frame, view: DenseView) -> list[Picture]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mvdyn_gtsam.refinement.initial import known_median
 from mvdyn_gtsam.refinement.other_times import (
     AROUND,
     LIKELIER,
@@ -12,7 +13,7 @@ from mvdyn_gtsam.refinement.other_times import (
     StaticRegions,
     better_swept,
     likelier_around,
-    median_likeness,
+    likenesses,
     plain_inside,
     static_regions,
     unlike_regions,
@@ -40,8 +41,12 @@ def moved(grey: np.ndarray, label: int) -> np.ndarray:
     return image
 
 
+def likeness_at(grey: np.ndarray, depth: float, others: list[Picture]) -> np.ndarray:
+    return known_median(likenesses(grey, at(depth).reshape(SHAPE), VIEW.rays, others))
+
+
 def found_in(grey: np.ndarray, depth: float, others: list[Picture]) -> StaticRegions:
-    alike, _ = median_likeness(grey, at(depth).reshape(SHAPE), VIEW.rays, others)
+    alike = likeness_at(grey, depth, others)
     return static_regions(labels(), alike, contrast(grey, PATCH) > TEXTURE, ALIKE)
 
 
@@ -81,8 +86,8 @@ def test_what_no_other_time_sees_is_left_open() -> None:
 def test_what_is_alike_at_no_depth_moves_unless_flow_explains_it() -> None:
     grey, side = wall_and_side()
     image = moved(grey, 2)
-    alike, views = median_likeness(image, at(WALL).reshape(SHAPE), VIEW.rays, [side])
-    assert views[30, 40] == 1 and views[30, 0] == 0
+    alike = likeness_at(image, WALL, [side])
+    assert np.isfinite(alike[30, 40]) and np.isnan(alike[30, 0])
     # patches of single pixels of noise are alike by chance here and there
     config = RefinementConfig(unlike_likeness=0.5)
     found = unlike_regions(alike, np.ones(SHAPE, bool), config)
@@ -97,8 +102,7 @@ def test_what_is_alike_at_no_depth_moves_unless_flow_explains_it() -> None:
 def test_the_swept_depth_is_taken_where_it_looks_clearly_better_and_only_there() -> None:
     grey, side = wall_and_side()
     config, everywhere = RefinementConfig(), np.ones(SHAPE, bool)
-    right, _ = median_likeness(grey, at(WALL).reshape(SHAPE), VIEW.rays, [side])
-    wrong, _ = median_likeness(grey, at(2.0 * WALL).reshape(SHAPE), VIEW.rays, [side])
+    right, wrong = (likeness_at(grey, depth, [side]) for depth in (WALL, 2.0 * WALL))
     seen = np.isfinite(right) & np.isfinite(wrong)
     assert better_swept(right, wrong, everywhere, config)[seen].mean() > 0.8
     for none in (
@@ -115,13 +119,12 @@ def test_plain_pixels_judge_together_what_each_alone_cannot() -> None:
     left = np.zeros(SHAPE, bool)
     left[:, :45] = True
     # of a single pixel the noise is five times the difference
-    swept = 0.3 + np.where(left, 2.0, 0.0) * LIKELIER + 10.0 * LIKELIER * noise[0]
-    swept, first = swept.astype(np.float32), np.full(SHAPE, 0.3, np.float32)
-    found = likelier_around(swept, first, np.ones(SHAPE, bool))
+    gain = (np.where(left, 2.0, 0.0) * LIKELIER + 10.0 * LIKELIER * noise).astype(np.float32)
+    found = likelier_around(gain, np.ones(SHAPE, bool))
     inner = slice(AROUND // 2, -AROUND // 2)
     assert found[inner, : 45 - AROUND].mean() > 0.7 and found[inner, 45 + AROUND :].mean() < 0.3
-    assert not likelier_around(swept, first, ~left)[left].any()
-    assert not likelier_around(np.full_like(swept, np.nan), first, np.ones(SHAPE, bool)).any()
+    assert not likelier_around(gain, ~left)[left].any()
+    assert not likelier_around(np.full_like(gain, np.nan), np.ones(SHAPE, bool)).any()
 
 
 def test_a_plain_region_follows_most_of_its_rim() -> None:
