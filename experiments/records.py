@@ -232,6 +232,16 @@ def run_experiment(
     return 0
 
 
+def exit_status(work: Callable[[], None]) -> int:
+    """0 after ``work``; 1 where it cannot be done, which is the last line on stderr then."""
+    try:
+        work()
+    except MvdynError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
 def captures_or_rendered(folders: Sequence[Path]) -> list[Path]:
     """``folders``, or the captures of ``../shared/data/rendered`` where none are given.
 

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from experiments.records import RESULTS, ExperimentError, commit, figure, page, table, write_text
-from mvdyn_gtsam.errors import MvdynError
+from experiments.records import RESULTS, ExperimentError, commit, exit_status, figure, page, table, write_text
 from mvdyn_gtsam.evaluation.alignment import align
 from mvdyn_gtsam.evaluation.groundtruth import GroundTruth, load_groundtruth
 from mvdyn_gtsam.reconstruction import Reconstruction
@@ -78,31 +77,32 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
+def measure(capture: Path, result: Path, height: float) -> str:
+    """The table: the lane before and after the refinement."""
+    refined, truth = Reconstruction.load(result), load_groundtruth(capture / "groundtruth")
+    rows = []
+    for name, depths in (("tracking", refined.tracked()), ("phases 1, 2", refined)):
+        errors = lane_errors(depths, truth, height)
+        near = 100.0 * float((errors < 0.25).mean())
+        rows.append(
+            [name, figure(float(np.median(errors)), 3), figure(float(errors.mean()), 3), figure(near)]
+        )
+    columns = ["depth", "median relative error", "mean", "within 25 % of the road, %"]
+    return f"{refined.name}, commit {commit()}.\n\n" + table(columns, rows)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure before and after the refinement, print and keep the table."""
+    """Print and keep the table."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     options = parser().parse_args(words)
-    try:
-        refined, truth = (
-            Reconstruction.load(options.result),
-            load_groundtruth(options.capture / "groundtruth"),
-        )
-        rows = []
-        for name, result in (("tracking", refined.tracked()), ("phases 1, 2", refined)):
-            errors = lane_errors(result, truth, options.height)
-            quarter = 100.0 * float((errors < 0.25).mean())
-            rows.append(
-                [name, figure(float(np.median(errors)), 3), figure(float(errors.mean()), 3), figure(quarter)]
-            )
-        columns = ["depth", "median relative error", "mean", "within 25 % of the road, %"]
-        body = f"{refined.name}, commit {commit()}.\n\n" + table(columns, rows)
+
+    def work() -> None:
+        body = measure(options.capture, options.result, options.height)
         text = page("Depth of the road", NAME, words, body)
         sys.stdout.write(text)
         write_text(options.results / f"{NAME}.md", text)
-    except MvdynError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    return 0
+
+    return exit_status(work)
 
 
 if __name__ == "__main__":

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.ablations.starts import read_start
+from experiments.records import exit_status
 from mvdyn_gtsam.capture import load_capture
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import load_config
-from mvdyn_gtsam.errors import MvdynError
 from mvdyn_gtsam.frontend.start import Start
 from mvdyn_gtsam.pipeline import reconstruct
 from mvdyn_gtsam.progress import Progress
@@ -34,15 +34,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Returns the exit status; what went wrong is the last line."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     capture, start, out = map(Path, words[:3])
-    try:
+
+    def work() -> None:
         given = GivenStart(read_start(start))
         reconstruct(
             load_capture(capture), out, load_config(None, words[3:]), stage="tracking", initializer=given
         )
-    except MvdynError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    return 0
+
+    return exit_status(work)
 
 
 if __name__ == "__main__":

@@ -205,9 +205,7 @@ def _look_near(
         cKDTree(features.pixels[free]), radius, output_type="coo_matrix"
     )
     row, column = near.row.astype(np.int64), near.col.astype(np.int64)
-    look = np.take(descriptor, row, axis=0)
-    look *= np.take(features.descriptors, free[column], axis=0)
-    look = look.sum(1)
+    look = (descriptor[row] * features.descriptors[free[column]]).sum(1)
     good = look > similarity
     row, column, look = row[good], column[good], look[good]
     order = np.argsort(-look, kind="stable")

@@ -49,13 +49,14 @@ RIM_SHARE = np.float32(0.05)
 compared on HoloLens, to 0.05 on multicamvideo: none let fills lean to what is behind, half kept noise."""
 AROUND = 15
 """Side of the squares over which plain pixels judge two depths together, px of the swept size: one patch of
-hardly any contrast is noise. Source: 9, 15 and 25 compared on HoloLens and KITTI."""
+hardly any contrast is noise. Source: 9, 15 and 25 compared on HoloLens and KITTI, when textured pixels still
+had a say."""
 LIKELIER = 0.05
 """By how much more alike the swept depth must look in their mean. Source: 0.03 to 0.1 compared there and on
-robodog_overlap."""
+robodog_overlap, likewise."""
 HELD_SHARE = np.float32(0.3)
-"""Information of what they say, of that of a pixel that speaks for itself. Source: 0.05 to 1 compared there:
-less lets the road of KITTI go flat, more keeps the noise of HoloLens."""
+"""Information of what they say, of that of a pixel that speaks for itself. Source: 0.05 to 1 compared there,
+likewise: less lets the road of KITTI go flat, more keeps the noise of HoloLens."""
 PLANE_SIDE = 0.12
 """Side of the squares whose planes smooth what they say, as a share of the width. Source: 25 and 41 px
 compared on HoloLens, without them noise stays."""
