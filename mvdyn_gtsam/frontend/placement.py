@@ -99,17 +99,37 @@ class Hypothesis:
     inliers: int
 
 
-def match_maps(map_a: CameraMap, map_b: CameraMap, config: PlacementConfig) -> PointMatches:
-    """Match frames of two cameras at all times and pool the matches by map point."""
-    observations: list[Index] = []
-    for frame_a in _spread(len(map_a.times), config.frames_per_camera):
-        for frame_b in _spread(len(map_b.times), config.frames_per_camera):
-            pairs = match_features(map_a.features[frame_a], map_b.features[frame_b], config.match_ratio)
-            point_a = map_a.point_of_keypoint[frame_a][pairs[:, 0]]
-            point_b = map_b.point_of_keypoint[frame_b][pairs[:, 1]]
-            both = (point_a >= 0) & (point_b >= 0)
-            frames = np.broadcast_to([frame_a, frame_b], (len(pairs), 2))
-            observations.append(np.column_stack([point_a, point_b, frames, pairs])[both])
+def match_maps(
+    map_a: CameraMap,
+    map_b: CameraMap,
+    config: PlacementConfig,
+    frames: tuple[Sequence[int], Sequence[int]] | None = None,
+    apart_px: float = 0.0,
+) -> PointMatches:
+    """Match frames of two cameras at all times and pool the matches by map point.
+
+    ``frames``: rows of either map, instead of some spread over its video.
+    ``apart_px``: see ``match_features``.
+    """
+    frames_a, frames_b = (
+        frames
+        if frames is not None
+        else (
+            _spread(len(map_a.times), config.frames_per_camera),
+            _spread(len(map_b.times), config.frames_per_camera),
+        )
+    )
+
+    def matched(frame_a: int, frame_b: int) -> Index:
+        first, second = map_a.features[frame_a], map_b.features[frame_b]
+        pairs = match_features(first, second, config.match_ratio, apart_px)
+        point_a = map_a.point_of_keypoint[frame_a][pairs[:, 0]]
+        point_b = map_b.point_of_keypoint[frame_b][pairs[:, 1]]
+        both = (point_a >= 0) & (point_b >= 0)
+        label = np.broadcast_to([frame_a, frame_b], (len(pairs), 2))
+        return np.column_stack([point_a, point_b, label, pairs])[both]
+
+    observations = list(in_order(partial(matched, a, b) for a in frames_a for b in frames_b))
     table = np.concatenate(observations) if observations else np.zeros((0, 6), np.int64)
     if len(table) == 0:
         point, pose, pixel = np.zeros((0, 3)), np.zeros((0, 4, 4)), np.zeros((0, 2))

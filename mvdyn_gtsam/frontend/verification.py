@@ -56,6 +56,13 @@ class Verdict:
     """Area that floats in front of what the other camera sees, or meets it and looks different."""
     frame_pairs: int
     """Pairs of frames with any overlap."""
+    comparable: float = 0.0
+    """Textured area that should meet the other camera's surface: all but what that one hides."""
+
+    @property
+    def share(self) -> float:
+        """Share of what could agree that does."""
+        return self.agreement / max(self.comparable, 1e-12)
 
     @property
     def trust(self) -> float:
@@ -74,17 +81,28 @@ def verify_placement(
 
     ``careful``: what looks different must do so within the tolerance of its depth; takes three times as long.
     """
-    agreement = contradiction = 0.0
+    agreement = contradiction = comparable = 0.0
     overlapping = 0
     bSa = aSb.inverse()
     for a in views_a:
         for b in views_b:
             forward = _testimony(a, b, bSa, config, careful)
             backward = _testimony(b, a, aSb, config, careful)
-            overlapping += forward[2] or backward[2]
-            agreement += forward[0] + backward[0]
-            contradiction += forward[1] + backward[1]
-    return Verdict(agreement, contradiction, overlapping)
+            overlapping += forward.overlaps or backward.overlaps
+            agreement += forward.agreement + backward.agreement
+            contradiction += forward.contradiction + backward.contradiction
+            comparable += forward.comparable + backward.comparable
+    return Verdict(agreement, contradiction, overlapping, comparable)
+
+
+@dataclass(frozen=True)
+class _Testimony:
+    """Shares of the source image, and whether the views overlap at all."""
+
+    agreement: float = 0.0
+    contradiction: float = 0.0
+    comparable: float = 0.0
+    overlaps: bool = False
 
 
 def _testimony(
@@ -93,18 +111,18 @@ def _testimony(
     targetSsource: Similarity,
     config: VerificationConfig,
     careful: bool,
-) -> tuple[float, float, bool]:
-    """Agreeing and contradicting shares of the source image, and whether the views overlap at all."""
+) -> _Testimony:
     known = np.isfinite(source.depth)
     z, x, y = _seen_at(source, target, targetSsource, known, 1.0)
     inside = known & _within(x, y, target)
     if not inside.any():
-        return 0.0, 0.0, False
+        return _Testimony()
     surface = _depth_at(target, x, y, inside)
     offset = np.log(np.where(inside, z, 1.0)) - np.log(surface)
     with np.errstate(invalid="ignore"):
         meets = np.abs(offset) < config.agree
         floats = offset < -config.conflict
+        not_hidden = offset < config.conflict
     look, textured = _look(source, target, x, y, inside, config)
     same = meets & textured & (look > config.same_look)
     different = meets & textured & (look < config.other_look)
@@ -114,7 +132,12 @@ def _testimony(
         again, _ = _look(source, target, x, y, known & _within(x, y, target), config)
         different &= ~(again >= config.other_look)
     total = len(source.depth)
-    return float(same.sum() / total), float((different | floats).sum() / total), True
+    return _Testimony(
+        float(same.sum() / total),
+        float((different | floats).sum() / total),
+        float((not_hidden & textured).sum() / total),
+        True,
+    )
 
 
 def _seen_at(

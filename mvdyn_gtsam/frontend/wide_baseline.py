@@ -9,7 +9,7 @@ bundle adjustment has the last word.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,13 +24,16 @@ from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map
 from mvdyn_gtsam.frontend.features import extract_features
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
+from mvdyn_gtsam.frontend.groups import Judge, Placement, balance, connect
 from mvdyn_gtsam.frontend.joint_adjustment import AdjustmentConfig, adjust_maps
+from mvdyn_gtsam.frontend.lifted_points import LiftConfig, lift_map, match_lifted
 from mvdyn_gtsam.frontend.placement import (
     PlacementConfig,
     PointMatches,
     agreeing_pairs,
     match_maps,
     propose_placements,
+    same_placement,
 )
 from mvdyn_gtsam.frontend.single_camera import CameraMap, build_camera_map, choose_frames
 from mvdyn_gtsam.frontend.start import Start, StartFrame
@@ -74,6 +77,7 @@ class WideBaselineConfig:
     ones had 0.78 to 0.99, false ones up to 0.77 where no true one beat them."""
     minimum_agreement: float = 0.01
     """Agreeing share of the image per frame pair it needs. Source: as above; true ones had 0.017 and more."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
     placement: PlacementConfig = field(default_factory=PlacementConfig)
     dense_map: DenseMapConfig = field(default_factory=DenseMapConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
@@ -98,17 +102,14 @@ class WideBaselineInitializer(Protocol):
 
 
 @dataclass(frozen=True)
-class Placement:
-    """A verified link between two cameras' maps."""
+class Candidate:
+    """A placement that is yet to be tried."""
 
-    first: int
-    second: int
-    aSb: Similarity
-    verdict: Verdict
-
-
-Judge = Callable[[int, int, Similarity], float]
-"""What speaks for a placement ``aSb`` of two cameras' maps, less what speaks against it."""
+    placement: Placement
+    inliers: int
+    """Matches that support it."""
+    alone: bool
+    """Whether they support it ``NEAR`` times as well as any other."""
 
 
 class ClassicalInitializer:
@@ -124,6 +125,8 @@ class ClassicalInitializer:
         config = self.config
         maps, dense = self._maps(capture, progress)
         links, matches = self._links(capture, dense, progress)
+        lifted = self._look_again(capture, dense, links, matches)
+        maps = [lifted[m.camera].sparse if m.camera in lifted else m for m in maps]
         views = self._still_views(capture, [m.camera for m in maps if not m.has_depth])
         placed = place_still_cameras(
             capture.cameras,
@@ -255,44 +258,119 @@ class ClassicalInitializer:
 
         Unless one is clear, those with most in their favour are tried out first.
         """
-        config = self.config
-        a, b = first.sparse.camera, second.sparse.camera
-        cameras = capture.cameras[a], capture.cameras[b]
-        likely = []
-        for hypothesis in propose_placements(
-            matches, cameras[0].intrinsics, cameras[1].intrinsics, config.placement
-        ):
-            if hypothesis.inliers < config.trial.minimum_inliers:
-                continue
-            verdict = verify_placement(first.views, second.views, hypothesis.aSb, config.verification)
-            if verdict.trust >= config.trial.minimum_trust:
-                likely.append(Placement(a, b, hypothesis.aSb, verdict))
-        likely.sort(key=lambda placement: -balance(placement.verdict))
+        likely = [candidate.placement for candidate in self._likely(capture, first, second, matches)]
         if self._clear(likely):
             return likely[:1]
         found: list[Placement] = []
         enough = -np.inf
-        for placement in likely[: config.trial.trials]:
+        for placement in likely[: self.config.trial.trials]:
             if balance(placement.verdict) < enough:
                 break
-            same_point = agreeing_pairs(
-                matches, placement.aSb, cameras[0].intrinsics, cameras[1].intrinsics, config.placement
-            )
-            aSb, verdict = try_placement(
-                cameras,
-                (first, second),
-                placement.aSb,
-                same_point,
-                config.adjustment,
-                config.trial,
-                config.dense_map,
-                config.verification,
-            )
-            logger.debug("%d - %d: %s became %s", a, b, placement.verdict, verdict)
-            if self._believed(verdict):
-                found.append(Placement(a, b, aSb, verdict))
+            tried = self._tried(capture, first, second, matches, placement)
+            if self._believed(tried.verdict):
+                found.append(tried)
                 enough = max(enough, balance(placement.verdict) / NEAR)
         return found
+
+    def _look_again(
+        self,
+        capture: Capture,
+        dense: Mapping[int, DenseMap],
+        links: list[Placement],
+        matches: dict[tuple[int, int], PointMatches],
+    ) -> dict[int, DenseMap]:
+        """Connect groups that ``links`` leave apart by all keypoints with depth, not triangulated ones alone.
+
+        ``links`` and ``matches`` grow. Returns the maps that took part, whose rows the new matches hold.
+        """
+        lifted: dict[int, DenseMap] = {}
+        for a, b in sorted(matches):
+            groups = connect(list(dense), links, self._judge(dense))
+            if any(a in group and b in group for group in groups):
+                continue
+            for camera in (a, b):
+                if camera not in lifted:
+                    lifted[camera] = lift_map(capture, dense[camera], self.config.lift, self.config.contrast)
+            pooled = match_lifted(lifted[a], lifted[b], self.config.lift, self.config.placement)
+            found = self._place_lifted(capture, lifted[a], lifted[b], pooled)
+            names = f"{capture.cameras[a].name} - {capture.cameras[b].name}"
+            logger.info("%s: %d placements believable on a second look", names, len(found))
+            if found:
+                links += found
+                matches[a, b] = pooled
+        return lifted
+
+    def _place_lifted(
+        self, capture: Capture, first: DenseMap, second: DenseMap, matches: PointMatches
+    ) -> list[Placement]:
+        """The placement with most in its favour among those that stand up to more doubt than others need.
+
+        Lifted keypoints propose more, so more that is false: patterns that repeat agree wherever they are
+        shifted to. What could be compared has to agree, and so has nearly all of the testimony, unless the
+        matches leave no other choice.
+        """
+        config = self.config
+        candidates = [
+            candidate
+            for candidate in self._likely(capture, first, second, matches)
+            if candidate.inliers >= config.lift.minimum_inliers
+        ]
+        found: list[Placement] = []
+        for candidate in candidates[: config.trial.trials]:
+            tried = self._tried(capture, first, second, matches, candidate.placement)
+            verdict = tried.verdict
+            trust = config.minimum_trust if candidate.alone else config.lift.minimum_trust
+            enough = verdict.agreement >= config.minimum_agreement * verdict.frame_pairs
+            if enough and verdict.trust >= trust and verdict.share >= config.lift.minimum_share:
+                found.append(tried)
+        return sorted(found, key=lambda placement: -balance(placement.verdict))[:1]
+
+    def _likely(
+        self, capture: Capture, first: DenseMap, second: DenseMap, matches: PointMatches
+    ) -> list[Candidate]:
+        """Proposals that dense warping does not refute outright, those with most in their favour first."""
+        config = self.config
+        a, b = first.sparse.camera, second.sparse.camera
+        intrinsics = capture.cameras[a].intrinsics, capture.cameras[b].intrinsics
+        hypotheses = propose_placements(matches, *intrinsics, config.placement)
+        likely = []
+        for hypothesis in hypotheses:
+            if hypothesis.inliers < config.trial.minimum_inliers:
+                continue
+            verdict = verify_placement(first.views, second.views, hypothesis.aSb, config.verification)
+            if verdict.trust >= config.trial.minimum_trust:
+                rivals = [h.support for h in hypotheses if not same_placement(h.aSb, hypothesis.aSb)]
+                alone = hypothesis.support >= NEAR * max(rivals, default=0.0)
+                likely.append(Candidate(Placement(a, b, hypothesis.aSb, verdict), hypothesis.inliers, alone))
+        return sorted(likely, key=lambda candidate: -balance(candidate.placement.verdict))
+
+    def _tried(
+        self,
+        capture: Capture,
+        first: DenseMap,
+        second: DenseMap,
+        matches: PointMatches,
+        placement: Placement,
+    ) -> Placement:
+        """The placement as a trial mends it, with the verdict after that."""
+        config = self.config
+        a, b = placement.first, placement.second
+        cameras = capture.cameras[a], capture.cameras[b]
+        same_point = agreeing_pairs(
+            matches, placement.aSb, cameras[0].intrinsics, cameras[1].intrinsics, config.placement
+        )
+        aSb, verdict = try_placement(
+            cameras,
+            (first, second),
+            placement.aSb,
+            same_point,
+            config.adjustment,
+            config.trial,
+            config.dense_map,
+            config.verification,
+        )
+        logger.debug("%d - %d: %s became %s", a, b, placement.verdict, verdict)
+        return Placement(a, b, aSb, verdict)
 
     def _believed(self, verdict: Verdict) -> bool:
         enough = verdict.agreement >= self.config.minimum_agreement * verdict.frame_pairs
@@ -331,73 +409,4 @@ def _with_lone_cameras(capture: Capture, start: Start, views: Mapping[int, Still
         groups=(*start.groups, *((camera,) for camera in lone)),
         frames=tuple(frames),
         notes=tuple(notes),
-    )
-
-
-def balance(verdict: Verdict) -> float:
-    """What speaks for a placement less what speaks against it."""
-    return verdict.agreement - verdict.contradiction
-
-
-def connect(
-    cameras: list[int], links: list[Placement], judge: Judge | None = None
-) -> list[dict[int, Similarity]]:
-    """Groups of connected cameras, each camera's map placed in its group's world (``wSm``).
-
-    Groups grow by one link at a time, the one with most in its favour first. With ``judge``, which says
-    what speaks for a placement of any two cameras, a link counts for what it implies for *every* pair of
-    cameras it brings together: a shift along a repeated texture can satisfy one pair, hardly all. A link
-    with more against it than for it joins nothing. The world of a group is the map of its lowest-numbered
-    camera.
-    """
-    group_of = {camera: {camera: Similarity.identity()} for camera in cameras}
-    known: dict[int, float] = {}
-    while True:
-        open_links = [
-            index for index, link in enumerate(links) if group_of[link.first] is not group_of[link.second]
-        ]
-        for index in open_links:
-            if index not in known:
-                known[index] = _value(links[index], group_of, judge)
-        if not open_links or known[best := max(open_links, key=lambda index: known[index])] <= 0.0:
-            break
-        first, second = group_of[links[best].first], group_of[links[best].second]
-        bridge = _bridge(links[best], group_of)
-        for camera, similarity in second.items():
-            first[camera] = bridge.compose(similarity)
-            group_of[camera] = first
-        # What a link into this group brings together has changed.
-        known = {
-            index: value
-            for index, value in known.items()
-            if group_of[links[index].first] is not first and group_of[links[index].second] is not first
-        }
-    groups: list[dict[int, Similarity]] = []
-    for camera in cameras:
-        group = group_of[camera]
-        if not any(group is other for other in groups):
-            groups.append(group)
-    return [
-        {camera: group[min(group)].inverse().compose(group[camera]) for camera in sorted(group)}
-        for group in groups
-    ]
-
-
-def _bridge(link: Placement, group_of: Mapping[int, Mapping[int, Similarity]]) -> Similarity:
-    """World of the first camera's group from the world of the second's."""
-    first, second = group_of[link.first], group_of[link.second]
-    return first[link.first].compose(link.aSb).compose(second[link.second].inverse())
-
-
-def _value(link: Placement, group_of: Mapping[int, Mapping[int, Similarity]], judge: Judge | None) -> float:
-    if judge is None:
-        return balance(link.verdict)
-    bridge = _bridge(link, group_of)
-    first, second = group_of[link.first], group_of[link.second]
-    # The link's own verdict is that of maps bent to fit, which the judge has not seen.
-    return balance(link.verdict) + sum(
-        judge(a, b, first[a].inverse().compose(bridge).compose(second[b]))
-        for a in first
-        for b in second
-        if {a, b} != {link.first, link.second}
     )

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+from dataclasses import replace
 
-from mvdyn_gtsam.frontend.features import Features, extract_features, match_features
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.features import (
+    Features,
+    extract_features,
+    extract_tilted_features,
+    match_features,
+)
 from tests.frontend.textures import texture, warped
 
 SHAPE = (160, 200)
@@ -83,3 +92,25 @@ def test_matches_are_those_of_comparing_all_at_once() -> None:
     expected = [(i, best[i]) for i in range(len(best)) if back[best[i]] == i and distinct[i]]
     assert len(expected) > 300
     np.testing.assert_array_equal(match_features(first, second, 0.8), expected)
+
+
+def test_what_is_seen_from_far_aside_is_matched_by_tilted_features_alone() -> None:
+    # as a wall seen at 65 degrees from its normal: 2.4 times narrower
+    narrow = np.diag([1.0 / 2.4, 1.0, 1.0])
+    images = colour(texture(SHAPE)), colour(warped(narrow, SHAPE))
+
+    def right(extract: Callable[[npt.NDArray[np.uint8], int, float], Features]) -> int:
+        first, second = (extract(image, 300, 0.01) for image in images)
+        pairs = match_features(first, second, 0.8, apart_px=4.0)
+        error = second.pixels[pairs[:, 1]] - first.pixels[pairs[:, 0]] * [1.0 / 2.4, 1.0]
+        return int((np.linalg.norm(error, axis=1) < 2.0).sum())
+
+    assert right(extract_tilted_features) > max(20, 3 * right(extract_features))
+
+
+def test_a_keypoint_found_twice_is_no_rival_of_itself() -> None:
+    first, second = at_angles(0.0, 180.0), at_angles(6.0, -6.5, 181.0)
+    close = replace(second, pixels=np.array([[10.0, 10.0], [12.0, 10.0], [90.0, 90.0]]))
+    assert match_features(first, second, 0.8).tolist() == [[1, 2]]
+    assert match_features(first, close, 0.8, apart_px=1.0).tolist() == [[1, 2]]
+    assert match_features(first, close, 0.8, apart_px=3.0).tolist() == [[0, 0], [1, 2]]

@@ -1,7 +1,8 @@
-"""From verified links to groups of cameras, and the classical start as a whole."""
+"""The classical start as a whole, and what it believes."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,101 +11,18 @@ import pytest
 from mvdyn_gtsam.capture import load_capture
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_flow import DisFlow
+from mvdyn_gtsam.frontend.groups import Placement
+from mvdyn_gtsam.frontend.lifted_points import LiftConfig
+from mvdyn_gtsam.frontend.placement import PlacementConfig
 from mvdyn_gtsam.frontend.start import Start
 from mvdyn_gtsam.frontend.verification import Verdict
 from mvdyn_gtsam.frontend.wide_baseline import (
+    Candidate,
     ClassicalInitializer,
-    Placement,
     WideBaselineConfig,
-    balance,
-    connect,
 )
 from mvdyn_gtsam.geometry import Similarity, rotation_angle_deg
-from tests.frontend.synthetic_maps import similarity
 from tests.tracking.synthetic_scene import Scene, two_cameras
-
-STRONG, WEAK = Verdict(5.0, 0.1, 10), Verdict(3.0, 2.5, 10)
-WORLD = {  # the world in each camera's map
-    0: similarity(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-    1: similarity(2.0, (0.0, 0.4, 0.0), (1.0, 0.0, 0.0)),
-    2: similarity(0.5, (0.2, 0.0, 0.1), (0.0, 1.0, 0.3)),
-    3: similarity(1.5, (0.0, -0.3, 0.2), (0.4, 0.0, 2.0)),
-}
-
-
-def link(first: int, second: int, verdict: Verdict = STRONG, error: Similarity | None = None) -> Placement:
-    aSb = WORLD[first].compose(WORLD[second].inverse())
-    return Placement(first, second, aSb if error is None else error.compose(aSb), verdict)
-
-
-def assert_true(group: dict[int, Similarity]) -> None:
-    """Every map where it truly stands in the map of the group's lowest camera."""
-    for camera, wSm in group.items():
-        expected = WORLD[min(group)].compose(WORLD[camera].inverse())
-        np.testing.assert_allclose(wSm.matrix(), expected.matrix(), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "links",
-    [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 3)], [(1, 3), (2, 3), (0, 3)]],
-    ids=["chain", "two pairs joined", "star around the last"],
-)
-def test_links_join_all_in_the_world_of_the_lowest(links: list[tuple[int, int]]) -> None:
-    groups = connect([0, 1, 2, 3], [link(*pair) for pair in links])
-    assert [sorted(group) for group in groups] == [[0, 1, 2, 3]]
-    assert_true(groups[0])
-    np.testing.assert_array_equal(groups[0][0].matrix(), np.eye(4))
-
-
-def test_unlinked_cameras_stay_apart() -> None:
-    groups = connect([0, 1, 2, 3], [link(1, 3)])
-    assert [sorted(group) for group in groups] == [[0], [1, 3], [2]]
-    for group in groups:
-        assert_true(group)
-    assert [sorted(group) for group in connect([2, 3], [])] == [[2], [3]]
-    assert connect([], []) == []
-
-
-def test_a_weak_link_that_contradicts_strong_ones_loses() -> None:
-    wrong = similarity(1.0, (0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
-    links = [link(0, 2, WEAK, wrong), link(0, 1), link(1, 2)]
-    for order in (links, links[::-1]):
-        (group,) = connect([0, 1, 2], order)
-        assert_true(group)
-
-
-def test_a_repeated_texture_that_satisfies_one_pair_loses_against_what_all_pairs_say() -> None:
-    wrong = similarity(1.0, (0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
-    favour = {(0, 1): 2.0, (1, 2): 0.5, (0, 2): 1.0}
-    links = [link(0, 1, Verdict(2.0, 0.0, 4)), link(1, 2, WEAK), link(0, 2, Verdict(1.2, 0.0, 4), wrong)]
-
-    def judge(a: int, b: int, aSb: Similarity) -> float:
-        a, b, aSb = (a, b, aSb) if a < b else (b, a, aSb.inverse())
-        true = WORLD[a].compose(WORLD[b].inverse())
-        if np.allclose(aSb.matrix(), true.matrix(), atol=1e-9):
-            return favour[a, b]
-        return 1.2 if (a, b) == (0, 2) else -3.0  # the shifted texture suits 0 and 2 better than the truth
-
-    (group,) = connect([0, 1, 2], links, judge)
-    assert_true(group)
-    # Without the third camera's word it wins.
-    (misled,) = connect([0, 2], [link(0, 2, Verdict(1.0, 0.0, 4)), links[2]], judge)
-    assert not np.allclose(misled[2].matrix(), group[2].matrix())
-
-
-def test_a_link_with_more_against_it_than_for_it_joins_nothing() -> None:
-    against = Verdict(1.0, 1.1, 4)
-    groups = connect([0, 1], [link(0, 1, against)], lambda a, b, aSb: 1.0)
-    assert [sorted(group) for group in groups] == [[0], [1]]
-    # The third camera's word counts as well.
-    links = [link(0, 1), link(1, 2, WEAK)]
-    groups = connect([0, 1, 2], links, lambda a, b, aSb: -1.0)
-    assert [sorted(group) for group in groups] == [[0, 1], [2]]
-
-
-def test_balance_weighs_both_sides() -> None:
-    assert balance(Verdict(2.0, 0.5, 4)) == 1.5
-    assert balance(Verdict(1.0, 3.0, 4)) == -2.0
 
 
 def test_nonsense_is_refused() -> None:
@@ -141,6 +59,71 @@ def test_two_cameras_of_one_scene_are_placed() -> None:
             ratio = frame.depth / scene.depths[camera][frame.time][y, x]
             assert len(ratio) > 50
             assert np.median(np.abs(ratio / np.median(ratio) - 1.0)) < 0.03
+
+
+@pytest.mark.slow
+def test_cameras_that_triangulated_points_leave_apart_are_connected_on_a_second_look() -> None:
+    scene = two_cameras()
+    config = WideBaselineConfig(
+        placement=PlacementConfig(match_ratio=0.05)
+    )  # hardly anything is that distinct
+    without = replace(config, lift=LiftConfig(match_ratio=0.05))
+    assert ClassicalInitializer(DisFlow(), without)(scene.capture()).groups == ((0,), (1,))
+    start = ClassicalInitializer(DisFlow(), config)(scene.capture())
+    assert start.groups == ((0, 1),)
+    position, rotation = start_errors(start, scene)
+    assert position < 0.05
+    assert rotation < 0.5
+
+
+class Judged(ClassicalInitializer):
+    """A start whose trials have come out already."""
+
+    inliers = 40
+
+    def __init__(self, candidates: list[tuple[Verdict, bool]]) -> None:
+        super().__init__(DisFlow())
+        self.candidates = [
+            Candidate(Placement(0, 1, Similarity.identity(), verdict), self.inliers, alone)
+            for verdict, alone in candidates
+        ]
+
+    def _likely(self, *_: object) -> list[Candidate]:
+        return self.candidates
+
+    def _tried(self, *arguments: object) -> Placement:
+        (placement,) = (argument for argument in arguments if isinstance(argument, Placement))
+        return placement
+
+
+def judged(*candidates: tuple[Verdict, bool]) -> list[Verdict]:
+    start = Judged(list(candidates))
+    capture, dense, matches = (None,) * 3
+    return [placement.verdict for placement in start._place_lifted(capture, dense, dense, matches)]  # type: ignore[arg-type]
+
+
+def test_a_second_look_asks_for_more_unless_the_matches_leave_no_choice() -> None:
+    sure, fair, doubtful = (Verdict(a, c, 10, 5.0) for a, c in ((4.0, 0.1), (4.0, 0.7), (4.0, 1.5)))
+    assert judged((sure, False)) == [sure]
+    assert judged((fair, False)) == []
+    assert judged((fair, True)) == [fair]
+    assert judged((doubtful, True)) == []
+    # a pattern that repeats: little of what could be compared agrees
+    assert judged((replace(sure, comparable=12.0), True)) == []
+    # next to nothing to go by
+    assert judged((Verdict(0.05, 0.0, 10, 0.06), True)) == []
+
+
+def test_a_second_look_needs_matches_enough_to_place_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    sure = Verdict(4.0, 0.1, 10, 5.0)
+    assert judged((sure, True)) == [sure]
+    monkeypatch.setattr(Judged, "inliers", 19)
+    assert judged((sure, True)) == []
+
+
+def test_a_second_look_believes_one_placement_at_most() -> None:
+    shifted, true = Verdict(3.0, 0.1, 10, 4.0), Verdict(4.0, 0.1, 10, 4.2)
+    assert judged((shifted, False), (true, False)) == [true]
 
 
 @pytest.mark.slow
