@@ -34,7 +34,7 @@ class LiftConfig:
     tilted_features: int = 500
     """Keypoints of each direction. Source: choice, time."""
     match_ratio: float = 0.8
-    """Lowe's ratio between cameras; Lowe 2004."""
+    """Lowe's ratio between cameras. Source: Lowe 2004."""
     apart_px: float = 4.0
     """Keypoints nearer than this are one seen from several directions, and no rivals. Source: choice."""
     minimum_trust: float = 0.9

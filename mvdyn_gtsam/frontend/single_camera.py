@@ -21,11 +21,14 @@ import numpy.typing as npt
 from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.features import Features, match_features
+from mvdyn_gtsam.frontend.followed_keypoints import Matches, joined_matches
 from mvdyn_gtsam.geometry import invert_pose, transform_points
 
 logger = logging.getLogger(__name__)
 
 
+LEAST_MATCHES = 15
+"""Of a pair of frames, to count: COLMAP's min_num_matches."""
 LEAST_STEP = 0.005
 """Narrowest step in image widths, 2.5 px of 512: a camera that stands still has no motion but noise."""
 
@@ -97,15 +100,19 @@ def build_camera_map(
     neighbours: int,
     ratio: float,
     minimum_angle_deg: float,
+    followed: Matches | None = None,
 ) -> CameraMap:
     """Structure from motion of camera number ``index`` alone, in a process of its own.
 
-    ``neighbours`` frames ahead are matched. A camera whose median triangulation angle stays below
+    ``neighbours`` frames ahead are matched; ``followed`` are matches found in another way, by rows of the
+    frames. A camera whose median triangulation angle stays below
     ``minimum_angle_deg`` is returned without points. May be called from several threads.
     """
     own = tuple(features)
     without_depth = _map_without_depth(index, times, own)
-    pairs = _match_neighbours(own, neighbours, ratio) if len(times) >= 3 else {}
+    pairs = match_neighbours(own, neighbours, ratio) if len(times) >= 3 else {}
+    pairs = joined_matches(pairs, followed or {})
+    pairs = {pair: matches for pair, matches in pairs.items() if len(matches) >= LEAST_MATCHES}
     if not pairs:
         return without_depth
     with tempfile.TemporaryDirectory() as folder:
@@ -141,15 +148,12 @@ def _solve(
         return dict(arrays)
 
 
-def _match_neighbours(
-    features: Sequence[Features], neighbours: int, ratio: float
-) -> dict[tuple[int, int], npt.NDArray[np.int64]]:
+def match_neighbours(features: Sequence[Features], neighbours: int, ratio: float) -> Matches:
+    """Matches of every frame's descriptors with those of the ``neighbours`` frames after it."""
     pairs = {}
     for first in range(len(features)):
         for second in range(first + 1, min(first + neighbours + 1, len(features))):
-            matches = match_features(features[first], features[second], ratio)
-            if len(matches) >= 15:  # COLMAP's min_num_matches
-                pairs[first, second] = matches
+            pairs[first, second] = match_features(features[first], features[second], ratio)
     return pairs
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -19,29 +19,28 @@ import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.capture.model import Capture
-from mvdyn_gtsam.errors import ConfigError
+from mvdyn_gtsam.frontend.camera_maps import map_camera
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
-from mvdyn_gtsam.frontend.dense_map import DenseMap, DenseMapConfig, densify_map
-from mvdyn_gtsam.frontend.features import extract_features
+from mvdyn_gtsam.frontend.dense_map import DenseMap
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
 from mvdyn_gtsam.frontend.groups import Judge, Placement, balance, connect
-from mvdyn_gtsam.frontend.joint_adjustment import AdjustmentConfig, adjust_maps
-from mvdyn_gtsam.frontend.lifted_points import LiftConfig, lift_map, match_lifted
+from mvdyn_gtsam.frontend.joint_adjustment import adjust_maps
+from mvdyn_gtsam.frontend.lifted_points import lift_map, match_lifted
 from mvdyn_gtsam.frontend.placement import (
-    PlacementConfig,
     PointMatches,
     agreeing_pairs,
     match_maps,
     propose_placements,
     same_placement,
 )
-from mvdyn_gtsam.frontend.single_camera import CameraMap, build_camera_map, choose_frames
+from mvdyn_gtsam.frontend.single_camera import CameraMap, choose_frames
 from mvdyn_gtsam.frontend.start import Start, StartFrame
-from mvdyn_gtsam.frontend.still_cameras import SamePoint, StillConfig, place_still_cameras
+from mvdyn_gtsam.frontend.start_settings import WideBaselineConfig
+from mvdyn_gtsam.frontend.still_cameras import SamePoint, place_still_cameras
 from mvdyn_gtsam.frontend.still_view import StillView, build_still_view, frames_of_view, lone_frames
 from mvdyn_gtsam.frontend.threads import flow_threads
-from mvdyn_gtsam.frontend.trial import TrialConfig, try_placement
-from mvdyn_gtsam.frontend.verification import Verdict, VerificationConfig, verify_placement
+from mvdyn_gtsam.frontend.trial import try_placement
+from mvdyn_gtsam.frontend.verification import Verdict, verify_placement
 from mvdyn_gtsam.geometry import Similarity
 from mvdyn_gtsam.progress import NullProgress, Progress
 
@@ -49,47 +48,6 @@ logger = logging.getLogger(__name__)
 
 NEAR = 2.0
 """How many times as much must speak for a believed placement as for another that need not be tried."""
-
-
-@dataclass(frozen=True)
-class WideBaselineConfig:
-    """The start without weights."""
-
-    frame_step: float = 0.03
-    """Image motion between a map's frames, in image widths. Source: experiments/wide_baseline.py."""
-    maximum_frames: int = 40
-    """Frames per camera at most; the step widens for longer videos. Source: choice, time."""
-    minimum_frames: int = 10
-    """Frames per camera at least, where the video has them; the step narrows for slow or short ones. Source:
-    experiments/start_variants.py; maps of three to seven frames were bent too far to be placed."""
-    features: int = 3000
-    """Keypoints per frame. Source: experiments/wide_baseline.py."""
-    contrast: float = 0.01
-    """SIFT contrast threshold; below the usual 0.04 for plain walls. Source: as above."""
-    neighbours: int = 4
-    """Frames ahead matched within a camera. Source: choice, time."""
-    ratio: float = 0.8
-    """Lowe's ratio within a camera. Source: Lowe 2004."""
-    minimum_parallax_deg: float = 1.0
-    """Median triangulation angle below which a camera counts as standing still. Source: choice."""
-    minimum_trust: float = 0.8
-    """Share of favourable testimony a mended placement needs. Source: experiments/start_variants.py; true
-    ones had 0.78 to 0.99, false ones up to 0.77 where no true one beat them."""
-    minimum_agreement: float = 0.01
-    """Agreeing share of the image per frame pair it needs. Source: as above; true ones had 0.017 and more."""
-    lift: LiftConfig = field(default_factory=LiftConfig)
-    placement: PlacementConfig = field(default_factory=PlacementConfig)
-    dense_map: DenseMapConfig = field(default_factory=DenseMapConfig)
-    verification: VerificationConfig = field(default_factory=VerificationConfig)
-    adjustment: AdjustmentConfig = field(default_factory=AdjustmentConfig)
-    still: StillConfig = field(default_factory=StillConfig)
-    trial: TrialConfig = field(default_factory=TrialConfig)
-
-    def __post_init__(self) -> None:
-        if min(self.maximum_frames, self.neighbours) < 2 or self.features < 100:
-            raise ConfigError("frontend.wide_baseline: at least 2 frames, 2 neighbours and 100 features")
-        if not 0.0 < self.frame_step < 0.5:
-            raise ConfigError(f"frontend.wide_baseline.frame_step is {self.frame_step}; between 0 and 0.5")
 
 
 class WideBaselineInitializer(Protocol):
@@ -196,9 +154,10 @@ class ClassicalInitializer:
         dense: dict[int, DenseMap] = {}
         # any other flow than one that may be called from several threads gets one caller
         workers = flow_threads() if isinstance(self.flow, OneWayFlow) else 1
+        mapped = partial(map_camera, capture, flow=self.flow, config=self.config)
         with ThreadPoolExecutor(workers) as pool:
             try:
-                for camera, (own, own_dense) in enumerate(pool.map(partial(self._map, capture), cameras)):
+                for camera, (own, own_dense) in enumerate(pool.map(mapped, cameras)):
                     maps.append(own)
                     if own_dense is not None:
                         dense[camera] = own_dense
@@ -207,30 +166,6 @@ class ClassicalInitializer:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
         return maps, dense
-
-    def _map(self, capture: Capture, camera: int) -> tuple[CameraMap, DenseMap | None]:
-        config = self.config
-        times, motion = choose_frames(
-            capture, camera, config.frame_step, config.maximum_frames, config.minimum_frames
-        )
-        features = [
-            extract_features(capture.read(camera, int(t)), config.features, config.contrast) for t in times
-        ]
-        own = build_camera_map(
-            camera,
-            capture.cameras[camera],
-            times,
-            features,
-            neighbours=config.neighbours,
-            ratio=config.ratio,
-            minimum_angle_deg=config.minimum_parallax_deg,
-        )
-        if not own.has_depth:
-            return own, None
-        # Where the frames are closer, as many neighbours reach as far.
-        spacing = max(motion / max(len(times) - 1, 1), 1e-6)
-        reach = round(config.dense_map.neighbours * config.frame_step / spacing)
-        return own, densify_map(capture, own, self.flow, config.dense_map, reach)
 
     def _links(
         self, capture: Capture, dense: Mapping[int, DenseMap], progress: Progress

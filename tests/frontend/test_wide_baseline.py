@@ -15,12 +15,9 @@ from mvdyn_gtsam.frontend.groups import Placement
 from mvdyn_gtsam.frontend.lifted_points import LiftConfig
 from mvdyn_gtsam.frontend.placement import PlacementConfig
 from mvdyn_gtsam.frontend.start import Start
+from mvdyn_gtsam.frontend.start_settings import WideBaselineConfig
 from mvdyn_gtsam.frontend.verification import Verdict
-from mvdyn_gtsam.frontend.wide_baseline import (
-    Candidate,
-    ClassicalInitializer,
-    WideBaselineConfig,
-)
+from mvdyn_gtsam.frontend.wide_baseline import Candidate, ClassicalInitializer
 from mvdyn_gtsam.geometry import Similarity, rotation_angle_deg
 from tests.tracking.synthetic_scene import Scene, two_cameras
 
