@@ -31,8 +31,10 @@ from mvdyn_gtsam.refinement.moving_depth import (
     region_depth,
     side_seen,
     smooth_over_time,
+    standing_still,
 )
 from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
+from mvdyn_gtsam.refinement.parts import depth_of_parts
 
 Mask = npt.NDArray[np.bool_]
 Labels = npt.NDArray[np.int32]
@@ -223,9 +225,10 @@ def depth_of_regions(
                 links.append((number[before, a], number[(camera, time), b]))
     result: dict[Frame, dict[int, KnownDepth]] = {frame: {} for frame in frames}
     if regions_found:
+        still = standing_still(regions_found, links)
         solved, belief = smooth_over_time(regions_found, sorted(links))
-        for region, theta, believed in zip(regions_found, solved, belief, strict=True):
-            if region.still:
+        for region, stands, theta, believed in zip(regions_found, still, solved, belief, strict=True):
+            if stands:
                 result[region.frame][region.label] = KnownDepth(region.matched, STATIC)
             elif believed > context.config.moving_evidence:
                 result[region.frame][region.label] = KnownDepth(float(theta), MOVING)
@@ -247,7 +250,8 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]
     moving = np.where(labels > 0, UNEXPLAINED, STATIC).astype(np.uint8)
     instant, rays = context.image("instant", frame), workspace.views[frame[0]].rays
     # what other frames' tasks change of these views meanwhile lies where something moves, and is not read
-    views = _instant_views(context, frame, 1) if depths else []
+    views, wide_views = (_instant_views(context, frame, margin) if depths else [] for margin in (1, MARGIN))
+    grey = context.luminance(frame)
     for label in range(1, int(labels.max()) + 1):
         region = labels == label
         if label not in depths:
@@ -256,6 +260,7 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]
         matched = np.log(region_depth(instant, region, depths[label].log_inverse_depth))
         moving[region] = depths[label].moving
         if depths[label].moving == MOVING:
+            matched = depth_of_parts(matched, region, grey, rays, wide_views)
             matched = matched + side_seen(matched, rays[region.ravel()], views)
         # nothing lies behind its background, which is known only about
         theta[region] = np.maximum(matched, theta[region] - BEHIND)

@@ -67,6 +67,9 @@ STILL = 0.3
 """Share of a region that another view must see as a still surface for it to stand still. Source: of the
 regions of robodog_overlap and multicamvideo still ones had 0.2 to 1, moving ones 0; of those of three_cameras
 some moving ones more than 0.2."""
+STILL_STEPS = 5
+"""Frames before and after that have a say in whether a thing stands still. Source: choice; frames that differ
+from those around them came in ones and twos."""
 MATCHED = 0.5
 """Support from which images match. Source: choice."""
 LEAST_SHARE = 0.1
@@ -244,6 +247,24 @@ def link(before: Labels, now: Labels) -> list[tuple[int, int]]:
         for (a, b), count in zip(pairs.T, shared, strict=True)
         if count >= LEAST_OVERLAP * min(sizes[0][a], sizes[1][b])
     ]
+
+
+def standing_still(regions: Sequence[RegionDepth], links: Sequence[tuple[int, int]]) -> Mask:
+    """Which of ``regions`` stand still ``(N,)``: what other views say of each, if they mostly say so of those
+    linked to it, up to ``STILL_STEPS`` frames away.
+
+    A thing that moves before and after does not stop for a frame. ``links`` as in ``smooth_over_time``.
+    """
+    count = len(regions)
+    still = np.array([region.still for region in regions], dtype=bool)
+    first, second = np.array(links, dtype=np.int64).reshape(-1, 2).T
+    ones = np.ones(len(first), dtype=np.int64)
+    steps = sparse.csr_array((ones, (first, second)), shape=(count, count))
+    steps = sparse.csr_array(steps + steps.T + sparse.eye_array(count, dtype=np.int64))
+    near = sparse.csr_array(sparse.eye_array(count, dtype=np.int64))
+    for _ in range(STILL_STEPS):
+        near = sparse.csr_array((near @ steps) > 0, dtype=np.int64)
+    return np.asarray(still & (2 * (near @ still.astype(np.int64)) > near.sum(axis=1)))
 
 
 def smooth_over_time(regions: Sequence[RegionDepth], links: Sequence[tuple[int, int]]) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from mvdyn_gtsam.refinement.moving_depth import (
     region_depth,
     side_seen,
     smooth_over_time,
+    standing_still,
     support,
 )
 from mvdyn_gtsam.refinement.views import DenseView
@@ -231,3 +232,27 @@ def test_a_single_region_keeps_its_depth() -> None:
     solved, belief = smooth_over_time([RegionDepth((0, 0), 1, -0.7, 0.5)], [])
     np.testing.assert_allclose(solved, [-0.7])
     np.testing.assert_allclose(belief, [0.5])
+
+
+def still_regions(still: list[bool], start: int = 0) -> list[RegionDepth]:
+    """One region in every frame."""
+    return [RegionDepth((0, start + time), 1, 0.0, 0.0, 0.0, value) for time, value in enumerate(still)]
+
+
+def test_a_thing_that_moves_before_and_after_does_not_stand_still_for_a_frame() -> None:
+    still = [False] * 10 + [True, False, True] + [False] * 10
+    assert not standing_still(still_regions(still), chain(23)).any()
+
+
+def test_what_mostly_stands_still_does_where_it_is_seen_to() -> None:
+    still = [True, True, False, True, True, False, True]
+    assert standing_still(still_regions(still), chain(7)).tolist() == still
+    # a thing that stops: both halves keep what is said of them
+    stops = [False] * 12 + [True] * 12
+    assert standing_still(still_regions(stops), chain(24)).tolist() == stops
+
+
+def test_other_things_have_no_say_in_whether_one_stands_still() -> None:
+    regions = still_regions([True]) + still_regions([False] * 4) + still_regions([True], 30)
+    assert standing_still(regions, [(1, 2), (2, 3), (3, 4)]).tolist() == [True] + [False] * 4 + [True]
+    assert standing_still(regions[:1], []).tolist() == [True]
