@@ -97,6 +97,11 @@ class DenseMap:
     seen: tuple[MeasuredView, ...] = ()
     """What ``views`` were solved from."""
 
+    @property
+    def known(self) -> float:
+        """Share of the views whose depth is to be trusted."""
+        return float(np.mean([np.isfinite(view.depth).mean() for view in self.views]))
+
 
 def testimony_flow(config: FlowConfig) -> FlowConfig:
     """Flow settings for depth that testifies about placements: smooth, for completeness decides.

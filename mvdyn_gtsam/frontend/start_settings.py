@@ -39,6 +39,10 @@ class WideBaselineConfig:
     """Share of a camera's flow that its map should explain; below, keypoints are followed along the flow, and
     the map that explains more is kept. Source: experiments/start_variants.py; maps within 3 % of the truth
     had 0.94 and more, but for one with 0.87, those beyond 10 % had 0.26 to 0.87."""
+    minimum_known: float = 0.1
+    """Share of its dense frames for which a map must know depth to be placed. Source: experiments/
+    start_variants.py; maps with 0.07 to 0.09 were 7 % off and more, and one was placed wrong; others had 0.22
+    and more."""
     minimum_trust: float = 0.8
     """Share of favourable testimony a mended placement needs. Source: experiments/start_variants.py; true
     ones had 0.78 to 0.99, false ones up to 0.77 where no true one beat them."""

@@ -171,7 +171,10 @@ class ClassicalInitializer:
         self, capture: Capture, dense: Mapping[int, DenseMap], progress: Progress
     ) -> tuple[list[Placement], dict[tuple[int, int], PointMatches]]:
         """Every believable placement of every pair of cameras, and the matches they come from."""
-        pairs = [(a, b) for a in dense for b in dense if a < b]
+        known = [camera for camera, own in dense.items() if own.known >= self.config.minimum_known]
+        for camera in sorted(set(dense) - set(known)):
+            logger.info("%s moves too little to be placed", capture.cameras[camera].name)
+        pairs = [(a, b) for a in known for b in known if a < b]
         links, matches = [], {}
         for number, (a, b) in enumerate(pairs):
             progress.update("start", len(pairs) + number, 2 * len(pairs), "placing cameras")

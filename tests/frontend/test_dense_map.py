@@ -64,6 +64,13 @@ def test_depth_is_right_where_it_is_given(dense: DenseMap, scene: Scene) -> None
         assert np.quantile(error, 0.9) < 0.1
 
 
+def test_known_is_the_share_with_depth(dense: DenseMap) -> None:
+    shares = [np.isfinite(view.depth).mean() for view in dense.views]
+    assert dense.known == pytest.approx(np.mean(shares))
+    none = [replace(view, depth=np.full_like(view.depth, np.nan)) for view in dense.views]
+    assert replace(dense, views=(dense.views[0], *none[1:])).known == pytest.approx(shares[0] / 3)
+
+
 def test_a_true_map_is_rigid_and_a_wrong_one_is_not(dense: DenseMap, scene: Scene) -> None:
     assert dense.rigidity > 0.95
     true = exact_map(scene)

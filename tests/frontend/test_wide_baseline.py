@@ -73,6 +73,13 @@ def test_cameras_that_triangulated_points_leave_apart_are_connected_on_a_second_
     assert rotation < 0.5
 
 
+@pytest.mark.slow
+def test_cameras_that_know_too_little_depth_are_not_placed() -> None:
+    start = ClassicalInitializer(DisFlow(), WideBaselineConfig(minimum_known=0.99))(two_cameras().capture())
+    assert start.groups == ((0,), (1,))
+    assert all(len(frames) > 3 for frames in start.frames)
+
+
 class Judged(ClassicalInitializer):
     """A start whose trials have come out already."""
 
