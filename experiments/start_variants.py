@@ -9,7 +9,8 @@ together. How much two cameras share is measured with the true depth. Verdicts, 
   apart   left apart, though the two share at least a fifth of their view
   right   all of the others
 
---only takes words; a variant is run when its name holds one of them.
+--only takes words; a variant is run when its name holds one of them. --random makes captures of whole length
+instead, with what they show drawn at random, and starts on those.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from experiments.altered_captures import Alteration, AlteredCapture, Part, alter_capture
 from experiments.records import (
@@ -73,6 +76,43 @@ SCENES = {
     "room_13": SceneSettings(seed=13, overlap=0.0, frames=40, repeat=0.4, every=5),
 }
 """Generated where a variant asks for them."""
+
+
+def random_scene(seed: int) -> SceneSettings:
+    """Two or three cameras, 60 frames; overlap, texture, repetition, motion, noise and place are drawn."""
+    random = np.random.default_rng(1000 + seed)
+    return SceneSettings(
+        seed=seed,
+        frames=60,
+        every=12,
+        cameras=int(random.choice([2, 2, 3])),
+        overlap=float(random.uniform(0.25, 0.45)),
+        texture=float(random.uniform(0.3, 0.9)),
+        repeat=float(random.choice([0.0, 0.2, 0.5])),
+        motion=float(random.uniform(0.3, 1.0)),
+        noise=float(random.choice([0.005, 0.02])),
+        exposure=float(random.choice([0.0, 0.1])),
+        camera_motion=float(random.uniform(0.25, 0.6)),
+        place="yard" if random.choice(["room", "room", "yard"]) == "yard" else "room",
+        meet=float(random.uniform(0.6, 1.5)),
+    )
+
+
+def random_variants(first: int, last: int) -> tuple[CaptureVariant, ...]:
+    """All cameras of the random scenes of these seeds."""
+    variants = []
+    for seed in range(first, last + 1):
+        name = f"random_{seed}"
+        cameras = range(random_scene(seed).cameras)
+        variants.append(CaptureVariant(name, tuple(Part(name, f"cam{camera}") for camera in cameras)))
+    return tuple(variants)
+
+
+def scene_of(name: str) -> SceneSettings | None:
+    """Settings of a generated capture; None for a rendered one."""
+    if name.startswith("random_"):
+        return random_scene(int(name.removeprefix("random_")))
+    return SCENES.get(name)
 
 
 def _both(capture: str, first: str, second: str, *alterations: Alteration, **frames: Any) -> tuple[Part, ...]:
@@ -196,8 +236,9 @@ def folders_of(variant: CaptureVariant, scenes: Path) -> dict[str, Path]:
     """
     folders = {}
     for name in dict.fromkeys(part.capture for part in variant.parts):
-        if name in SCENES:
-            folders[name] = make_scene(SCENES[name], scenes / name)
+        scene = scene_of(name)
+        if scene is not None:
+            folders[name] = make_scene(scene, scenes / name)
         elif (RENDERED / name).is_dir():
             folders[name] = RENDERED / name
         else:
@@ -291,6 +332,9 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     result = experiment_parser(NAME, __doc__, captures=False)
     result.add_argument("--only", nargs="+", metavar="WORD", help="variants whose name holds one of these")
+    result.add_argument(
+        "--random", nargs=2, type=int, metavar=("FIRST", "LAST"), help="seeds of captures drawn at random"
+    )
     result.add_argument("--name", default=NAME, help="of the Markdown file (default: %(default)s)")
     return result
 
@@ -304,7 +348,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         config = load_config(None, options.overrides)
         chosen = [
             variant
-            for variant in VARIANTS
+            for variant in (random_variants(*options.random) if options.random else VARIANTS)
             if options.only is None or any(word in variant.name for word in options.only)
         ]
         if not chosen:

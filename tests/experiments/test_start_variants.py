@@ -18,7 +18,16 @@ from experiments.altered_captures import (
 )
 from experiments.records import ExperimentError
 from experiments.start_errors import PairError, StartScore
-from experiments.start_variants import ORDER, SCENES, VARIANTS, main, verdict
+from experiments.start_variants import (
+    ORDER,
+    SCENES,
+    VARIANTS,
+    main,
+    random_scene,
+    random_variants,
+    scene_of,
+    verdict,
+)
 from mvdyn_gtsam.capture import load_capture
 from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.geometry import project
@@ -123,6 +132,17 @@ def test_every_variant_has_its_own_name_and_the_generated_scenes_exist() -> None
         "robodog_overlap", "dynamic_human", "roboarm", "three_cameras", "multicamvideo", "robodog_nonoverlap",
     }  # fmt: skip
     assert {part.capture for variant in VARIANTS for part in variant.parts} <= rendered | set(SCENES)
+
+
+def test_random_scenes_are_those_of_their_seeds_and_have_all_cameras() -> None:
+    variants = random_variants(100, 105)
+    assert [variant.name for variant in variants] == [f"random_{seed}" for seed in range(100, 106)]
+    for variant in variants:
+        scene = scene_of(variant.name)
+        assert scene is not None and scene == random_scene(scene.seed)
+        assert [part.camera for part in variant.parts] == [f"cam{k}" for k in range(scene.cameras)]
+    assert len({scene_of(variant.name) for variant in variants}) == 6
+    assert scene_of("robodog_overlap") is None and scene_of("room_3") is SCENES["room_3"]
 
 
 def test_an_unknown_word_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
