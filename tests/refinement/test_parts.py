@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.refinement import parts
 from mvdyn_gtsam.refinement.moving_depth import InstantView
 from mvdyn_gtsam.refinement.parts import STEP, depth_of_parts
 from tests.refinement.test_moving_depth import EVERYWHERE, INTRINSICS, RAYS, SHAPE, textured
@@ -68,6 +69,15 @@ def test_a_depth_that_is_denied_is_not_taken() -> None:
     wall_before = seen_from_aside(grey, LEFT, nothing_there)
     wall_before.theta[:] = FAR + 0.01
     assert shares(depth_of_parts(one, REGION, grey, RAYS, [wall_before]))[1] < 0.1
+
+
+def test_what_looks_too_little_alike_stays_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    grey = textured()
+    one = np.full(len(ROWS), NEAR, np.float32)
+    view = seen_from_aside((0.5 * (grey + textured(1))).astype(np.float32), LEFT)
+    assert shares(depth_of_parts(one, REGION, grey, RAYS, [view]))[1] > 0.5
+    monkeypatch.setattr(parts, "LEAST", 0.95)
+    np.testing.assert_array_equal(depth_of_parts(one, REGION, grey, RAYS, [view]), one)
 
 
 @pytest.mark.parametrize("contrast", [0.0, 1.0])
