@@ -1,4 +1,4 @@
-"""The wide-baseline start on captures it was not developed on: altered rendered ones, and generated ones.
+"""The wide-baseline start on altered rendered captures, and on generated ones.
 
 Pieces of their videos in time, pairs of cameras, crops that leave a fifth of the view in common or none,
 reversed and shifted time, half the resolution, fewer frames, worse images, cameras of different scenes put

@@ -83,7 +83,8 @@ class ClassicalInitializer:
         config = self.config
         maps, dense = self._maps(capture, progress)
         links, matches = self._links(capture, dense, progress)
-        lifted = self._look_again(capture, dense, links, matches)
+        more, matches, lifted = self._look_again(capture, dense, links, matches)
+        links += more
         maps = [lifted[m.camera].sparse if m.camera in lifted else m for m in maps]
         views = self._still_views(capture, [m.camera for m in maps if not m.has_depth])
         placed = place_still_cameras(
@@ -205,7 +206,7 @@ class ClassicalInitializer:
             if balance(placement.verdict) < enough:
                 break
             tried = self._tried(capture, first, second, matches, placement)
-            if self._believed(tried.verdict):
+            if self._believed(tried.verdict, self.config.minimum_trust):
                 found.append(tried)
                 enough = max(enough, balance(placement.verdict) / NEAR)
         return found
@@ -214,29 +215,32 @@ class ClassicalInitializer:
         self,
         capture: Capture,
         dense: Mapping[int, DenseMap],
-        links: list[Placement],
-        matches: dict[tuple[int, int], PointMatches],
-    ) -> dict[int, DenseMap]:
+        links: Sequence[Placement],
+        matches: Mapping[tuple[int, int], PointMatches],
+    ) -> tuple[list[Placement], dict[tuple[int, int], PointMatches], dict[int, DenseMap]]:
         """Connect groups that ``links`` leave apart by all keypoints with depth, not triangulated ones alone.
 
-        ``links`` and ``matches`` grow. Returns the maps that took part, whose rows the new matches hold.
+        Returns further links, the matches with those of the new links, and the maps that took part, whose
+        rows these matches hold.
         """
+        more: list[Placement] = []
+        pooled = dict(matches)
         lifted: dict[int, DenseMap] = {}
         for a, b in sorted(matches):
-            groups = connect(list(dense), links, self._judge(dense))
+            groups = connect(list(dense), [*links, *more], self._judge(dense))
             if any(a in group and b in group for group in groups):
                 continue
             for camera in (a, b):
                 if camera not in lifted:
                     lifted[camera] = lift_map(capture, dense[camera], self.config.lift, self.config.contrast)
-            pooled = match_lifted(lifted[a], lifted[b], self.config.lift, self.config.placement)
-            found = self._place_lifted(capture, lifted[a], lifted[b], pooled)
+            own = match_lifted(lifted[a], lifted[b], self.config.lift, self.config.placement)
+            found = self._place_lifted(capture, lifted[a], lifted[b], own)
             names = f"{capture.cameras[a].name} - {capture.cameras[b].name}"
             logger.info("%s: %d placements believable on a second look", names, len(found))
             if found:
-                links += found
-                matches[a, b] = pooled
-        return lifted
+                more += found
+                pooled[a, b] = own
+        return more, pooled, lifted
 
     def _place_lifted(
         self, capture: Capture, first: DenseMap, second: DenseMap, matches: PointMatches
@@ -256,10 +260,8 @@ class ClassicalInitializer:
         found: list[Placement] = []
         for candidate in candidates[: config.trial.trials]:
             tried = self._tried(capture, first, second, matches, candidate.placement)
-            verdict = tried.verdict
             trust = config.minimum_trust if candidate.alone else config.lift.minimum_trust
-            enough = verdict.agreement >= config.minimum_agreement * verdict.frame_pairs
-            if enough and verdict.trust >= trust and verdict.share >= config.lift.minimum_share:
+            if self._believed(tried.verdict, trust) and tried.verdict.share >= config.lift.minimum_share:
                 found.append(tried)
         return sorted(found, key=lambda placement: -balance(placement.verdict))[:1]
 
@@ -310,13 +312,13 @@ class ClassicalInitializer:
         logger.debug("%d - %d: %s became %s", a, b, placement.verdict, verdict)
         return Placement(a, b, aSb, verdict)
 
-    def _believed(self, verdict: Verdict) -> bool:
+    def _believed(self, verdict: Verdict, trust: float) -> bool:
         enough = verdict.agreement >= self.config.minimum_agreement * verdict.frame_pairs
-        return enough and verdict.trust >= self.config.minimum_trust
+        return enough and verdict.trust >= trust
 
     def _clear(self, likely: Sequence[Placement]) -> bool:
         """Whether the first is to be believed as it is, and no other comes near it: no need for trials."""
-        if not likely or not self._believed(likely[0].verdict):
+        if not likely or not self._believed(likely[0].verdict, self.config.minimum_trust):
             return False
         return all(NEAR * balance(other.verdict) < balance(likely[0].verdict) for other in likely[1:])
 
