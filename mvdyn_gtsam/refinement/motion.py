@@ -27,7 +27,7 @@ from mvdyn_gtsam.refinement.moving_depth import (
     InstantView,
     RegionDepth,
     link,
-    observed_depth,
+    observed_region,
     region_depth,
     side_seen,
     smooth_over_time,
@@ -182,7 +182,7 @@ def observe_task(context: Context, frame: Frame) -> list[RegionDepth]:
     grey, instant = context.luminance(frame), context.image("instant", frame)
     rays = workspace.views[frame[0]].rays
     return [
-        RegionDepth(frame, label, *observed_depth(instant, labels == label, grey, rays, views))
+        observed_region(frame, label, instant, labels == label, grey, rays, views)
         for label in range(1, int(labels.max()) + 1)
     ]
 

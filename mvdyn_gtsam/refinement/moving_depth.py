@@ -8,7 +8,7 @@ as the images of its instant support it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,29 +115,30 @@ def contradicted(theta: Float32, rays: Float32, views: Sequence[InstantView]) ->
     cameras moves in both.
     """
     denied = np.zeros(len(theta), bool)
-    for view in views:
-        farther, (row, column) = depth_beyond(theta, rays, view)
-        denied |= (farther > -HIDDEN) & ~view.moves[row, column]
+    for farther, moves in _seen_by(views, theta, rays):
+        denied |= (farther > -HIDDEN) & ~moves
     return denied
 
 
 def still_there(theta: Float32, rays: Float32, views: Sequence[InstantView]) -> float:
     """Largest share of the points, as in ``contradicted``, where a view sees a still surface at their
     depth."""
-    shares = [0.0]
-    for view in views:
-        farther, (row, column) = depth_beyond(theta, rays, view)
-        shares.append(float(((np.abs(farther) < AGREES) & ~view.moves[row, column]).mean()))
-    return max(shares)
+    seen = _seen_by(views, theta, rays)
+    return max((float(((np.abs(farther) < AGREES) & ~moves).mean()) for farther, moves in seen), default=0.0)
 
 
 def moving_there(theta: Float32, rays: Float32, views: Sequence[InstantView]) -> float:
     """Largest share of the points, as in ``contradicted``, that a view sees where something moves."""
-    shares = [0.0]
+    seen = _seen_by(views, theta, rays)
+    return max((float((np.isfinite(farther) & moves).mean()) for farther, moves in seen), default=0.0)
+
+
+def _seen_by(views: Sequence[InstantView], theta: Float32, rays: Float32) -> Iterator[tuple[Float32, Mask]]:
+    """Per view how much farther than the points, ``(M,)`` as ``depth_beyond`` says, it sees a still surface,
+    and whether something moves ``(M,)`` there."""
     for view in views:
         farther, (row, column) = depth_beyond(theta, rays, view)
-        shares.append(float((np.isfinite(farther) & view.moves[row, column]).mean()))
-    return max(shares)
+        yield farther, view.moves[row, column]
 
 
 def commonest(values: Float32) -> float:
@@ -149,22 +150,27 @@ def commonest(values: Float32) -> float:
     return float(np.median(values[np.abs(values - centre) < TOLERANCE]))
 
 
-def observed_depth(
-    instant: Float32, region: Mask, grey: Float32, rays: Float32, views: Sequence[InstantView]
-) -> tuple[float, float, float, bool]:
-    """Log inverse depth of ``region (h, w)`` that most of its pixels have in ``instant (h, w)``, the evidence
-    for it in [0, 1], and what ``RegionDepth.matched`` and ``still`` say.
+def observed_region(
+    frame: Frame,
+    label: int,
+    instant: Float32,
+    region: Mask,
+    grey: Float32,
+    rays: Float32,
+    views: Sequence[InstantView],
+) -> RegionDepth:
+    """What ``views`` say of ``region (h, w)``, the one of that ``label`` in ``frame``.
 
-    Evidence is how alike the images are there, as far as another view sees it move there and none denies it.
-
-    ``grey (h, w)`` is the image and ``rays (h w, 3)`` those of its pixels.
+    Its depth is what most of its pixels have in ``instant (h, w)``, inverse depths; the evidence is how alike
+    the images are there, as far as another view sees it move there and none denies it. ``grey (h, w)`` is the
+    image and ``rays (h w, 3)`` those of its pixels.
     """
     values, own = np.log(instant[region]), rays[region.ravel()]
     matched = commonest(values)
     if support(grey, region, matched, rays, views) < MATCHED:
         matched = np.nan
     elif still_there(np.full(len(own), matched, np.float32), own, views) > STILL:
-        return matched, 0.0, matched, True
+        return RegionDepth(frame, label, matched, 0.0, matched, still=True)
     kept = ~contradicted(values, own, views)
     if kept.mean() > LEAST_SHARE:
         values = values[kept]
@@ -172,7 +178,8 @@ def observed_depth(
     even = np.full(len(own), depth, np.float32)
     witnessed = min(1.0, moving_there(even, own, views) / WITNESSED)
     witnessed *= 1.0 - float(contradicted(even, own, views).mean())
-    return depth, support(grey, region, depth, rays, views) * witnessed, matched, False
+    evidence = support(grey, region, depth, rays, views) * witnessed
+    return RegionDepth(frame, label, depth, evidence, matched)
 
 
 def region_depth(instant: Float32, region: Mask, log_inverse_depth: float) -> Float32:

@@ -17,7 +17,7 @@ from mvdyn_gtsam.refinement.moving_depth import (
     contradicted,
     link,
     moving_there,
-    observed_depth,
+    observed_region,
     region_depth,
     side_seen,
     smooth_over_time,
@@ -102,24 +102,31 @@ def test_what_is_hidden_or_outside_is_not_denied() -> None:
     assert denied_share(0.1, nothing_moves) == 0.0
 
 
+def observed(instant: Float32, grey: Float32, view: InstantView) -> RegionDepth:
+    """What one view says of the region, the first of its frame."""
+    region = observed_region((0, 3), 1, instant, REGION, grey, RAYS, [view])
+    assert (region.frame, region.label) == ((0, 3), 1)
+    return region
+
+
 def test_the_observed_depth_is_one_that_no_camera_denies() -> None:
     """Two thirds of the pixels agree on a depth where the other camera sees nothing move."""
     grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
     instant[20:33] = 2.5
     view = beside(grey, 8, np.roll(REGION, -8, axis=1))
-    found, evidence, matched, still = observed_depth(instant, REGION, grey, RAYS, [view])
-    assert np.exp(found) == pytest.approx(0.5, rel=0.02)
-    assert evidence == 1.0
+    found = observed(instant, grey, view)
+    assert np.exp(found.log_inverse_depth) == pytest.approx(0.5, rel=0.02)
+    assert found.evidence == 1.0
     # most pixels lie where the images do not match
-    assert np.isnan(matched) and not still
+    assert np.isnan(found.matched) and not found.still
 
 
 def test_a_depth_that_is_denied_is_no_evidence() -> None:
     grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
-    assert observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8)])[1] == 1.0
-    _, evidence, matched, still = observed_depth(instant, REGION, grey, RAYS, [beside(grey, 8, ~EVERYWHERE)])
+    assert observed(instant, grey, beside(grey, 8)).evidence == 1.0
+    found = observed(instant, grey, beside(grey, 8, ~EVERYWHERE))
     # but a still thing may well stand there
-    assert evidence == 0.0 and np.exp(matched) == pytest.approx(0.5, rel=0.02) and not still
+    assert found.evidence == 0.0 and np.exp(found.matched) == pytest.approx(0.5, rel=0.02) and not found.still
 
 
 def test_what_another_view_sees_stand_still_there_does_not_move() -> None:
@@ -129,9 +136,9 @@ def test_what_another_view_sees_stand_still_there_does_not_move() -> None:
     jTi[0, 3] = -3.0 * 5.0 / 70.0
     wall = np.full(SHAPE, np.log(0.2), np.float32)
     view = InstantView(np.roll(grey, -3, axis=1), INTRINSICS, jTi, wall, ~EVERYWHERE)
-    found, evidence, matched, still = observed_depth(instant, REGION, grey, RAYS, [view])
-    assert still and evidence == 0.0
-    assert np.exp(found) == np.exp(matched) == pytest.approx(0.2, rel=0.02)
+    found = observed(instant, grey, view)
+    assert found.still and found.evidence == 0.0
+    assert found.log_inverse_depth == found.matched == pytest.approx(np.log(0.2), abs=0.02)
 
 
 def test_a_thing_that_no_view_sees_move_is_not_believed() -> None:
