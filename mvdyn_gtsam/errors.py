@@ -13,6 +13,10 @@ class ConfigError(MvdynError):
     """A configuration key is unknown or its value is out of range."""
 
 
+class DepthPriorError(MvdynError):
+    """A depth prior cannot be used: its predictions are malformed or fit no scale of the scene."""
+
+
 class TrackingError(MvdynError):
     """The capture was read but no reconstruction could be made of it."""
 

@@ -15,12 +15,23 @@ Float32 = npt.NDArray[np.float32]
 class DepthPrior(Protocol):
     """Anything that predicts depth from one image."""
 
-    def predict(
-        self, image: npt.NDArray[np.uint8], intrinsics: npt.NDArray[np.float64]
-    ) -> tuple[Float32, Float32 | None] | None:
-        """Depth ``(H, W)`` (NaN = invalid) and confidence ``(H, W)`` in [0, 1] or None; None without a prior.
+    @property
+    def name(self) -> str:
+        """What the manifest calls it; a run is not resumed with a prior of another name."""
+        ...
 
-        ``image`` is ``(H, W, 3) uint8`` RGB, ``intrinsics (3, 3)``. The scale is the prior's own.
+    def predict(
+        self,
+        image: npt.NDArray[np.uint8],
+        intrinsics: npt.NDArray[np.float64],
+        camera: str,
+        time: int,
+    ) -> tuple[Float32, Float32 | None] | None:
+        """Depth ``(H, W)`` and confidence ``(H, W)`` in [0, 1] or None; None for a frame it does not know.
+
+        ``image`` is ``(H, W, 3) uint8`` RGB, ``intrinsics (3, 3)``; ``camera`` and ``time`` say which frame
+        it is. Depth is z-depth, not inverse, up to a scale and an offset that are the same for all frames;
+        what is not finite or not positive is unknown. Asked at most once per frame and run.
         """
         ...
 
@@ -28,7 +39,15 @@ class DepthPrior(Protocol):
 class NoDepthPrior:
     """The default: depth is carried over by the flow."""
 
-    def predict(self, image: npt.NDArray[np.uint8], intrinsics: npt.NDArray[np.float64]) -> None:
+    name = "none"
+
+    def predict(
+        self,
+        image: npt.NDArray[np.uint8],
+        intrinsics: npt.NDArray[np.float64],
+        camera: str,
+        time: int,
+    ) -> None:
         """None."""
         return None
 
@@ -56,8 +75,9 @@ def align_scale_offset(
     """One global ``s, o`` minimising ``sum_k ||s D_mono^k + o - D_init^k||^2`` (paper, prior alignment).
 
     The k-th depths have one shape and any unit; pixels that are NaN in either do not count. ``robust``
-    re-weights by Cauchy's loss at the median absolute residual, so that what moves or is wrong does not
-    pull. Raises ValueError for different shapes and when the scale is not determined or not positive.
+    begins with a line through medians and re-weights by Cauchy's loss at the median absolute residual, so
+    that what moves or is wrong in either does not pull. Raises ValueError for different shapes and when the
+    scale is not determined or not positive.
     """
     if len(prior_depths) != len(initial_depths):
         raise ValueError(f"{len(prior_depths)} prior depths against {len(initial_depths)} initial ones")
@@ -66,6 +86,8 @@ def align_scale_offset(
     initial = np.concatenate([d for _, d in pairs]) if pairs else np.zeros(0)
     weight = np.ones_like(prior)
     result = _solve(prior, initial, weight)
+    if robust:
+        result = _median_line(prior, initial)
     for _ in range(iterations if robust else 0):
         residual = result.scale * prior + result.offset - initial
         spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-9 * float(np.abs(initial).max()))
@@ -73,6 +95,16 @@ def align_scale_offset(
     if not result.scale > 0.0:
         raise ValueError(f"the prior's depth falls as the reconstruction's rises (scale {result.scale:.3g})")
     return result
+
+
+def _median_line(prior: npt.NDArray[np.float64], initial: npt.NDArray[np.float64]) -> ScaleOffset:
+    """Median slope of pairs half the samples apart (Theil 1950): least squares would begin at the mercy of a
+    prior's few very far or near depths."""
+    order = np.argsort(prior, kind="stable")
+    low, high = order[: len(order) // 2], order[-(len(order) // 2) :]
+    rise = prior[high] > prior[low]
+    scale = float(np.median((initial[high] - initial[low])[rise] / (prior[high] - prior[low])[rise]))
+    return ScaleOffset(scale, float(np.median(initial - scale * prior)))
 
 
 def _valid(prior: npt.NDArray[Any], initial: npt.NDArray[Any]) -> tuple[npt.NDArray[np.float64], ...]:

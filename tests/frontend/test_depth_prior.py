@@ -45,6 +45,18 @@ def test_robust_alignment_ignores_a_fifth_of_nonsense() -> None:
     assert (robust.scale, robust.offset) == pytest.approx((2.0, 1.0), abs=0.02)
 
 
+def test_robust_alignment_ignores_a_fifth_of_nonsense_in_the_prior() -> None:
+    rng = np.random.default_rng(5)
+    initial = _depths(5, 8)
+    prior = [2.0 * depth + 1.0 + 0.01 * rng.standard_normal(depth.shape) for depth in initial]
+    for depth in prior:
+        depth[rng.random(depth.shape) < 0.2] = 100.0
+    with pytest.raises(ValueError, match="falls"):
+        align_scale_offset(prior, initial)
+    robust = align_scale_offset(prior, initial, robust=True)
+    assert (robust.scale, robust.offset) == pytest.approx((0.5, -0.5), abs=0.01)
+
+
 def test_what_cannot_be_determined_is_refused() -> None:
     depth = _depths(5, 1)
     with pytest.raises(ValueError, match="no valid pixel"):
@@ -66,4 +78,4 @@ def test_applying_marks_what_falls_behind_the_camera() -> None:
 
 def test_the_default_has_no_opinion() -> None:
     prior: DepthPrior = NoDepthPrior()
-    assert prior.predict(np.zeros((4, 4, 3), np.uint8), np.eye(3)) is None
+    assert prior.predict(np.zeros((4, 4, 3), np.uint8), np.eye(3), "cam0", 0) is None
