@@ -113,7 +113,10 @@ class TrackingConfig:
     the depth map, whose shape is solved anew between solves of the poses (fixed_shape) or stays as carried
     over from the start (carried_shape). Source: DESIGN 5; the others are for experiments/ablations."""
     depth_prior_lambda: float = 0.005
-    """Weight of the depth prior against the flow. Source: paper supplement, parameters (Eq. 4)."""
+    """Weight of the depth prior, if there is one, against the flow; 0: it only fills in what no flow carried.
+    In Eq. 4 flow residuals are at 1/8 resolution and depth is inverse, of median 1; in pixels and log depth,
+    against noise_px, that is a standard deviation of noise_px / (8 sqrt(lambda)), 0.35 by default, over
+    the root of the prior's confidence. Source: paper supplement, parameters (Eq. 4)."""
     grid_points: int = 768
     """Grid points per frame, about. Source: DESIGN 5."""
     keyframe_px: float = 2.0

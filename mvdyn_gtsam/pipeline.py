@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -14,15 +15,18 @@ import numpy as np
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import Config, to_dict
 from mvdyn_gtsam.errors import ResultError
+from mvdyn_gtsam.frontend.aligned_prior import AlignedPrior, align_to_start
 from mvdyn_gtsam.frontend.dense_depth import upsample_depth
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, DisFlow
 from mvdyn_gtsam.frontend.dense_map import testimony_flow
+from mvdyn_gtsam.frontend.depth_prior import DepthPrior, NoDepthPrior
+from mvdyn_gtsam.frontend.predictions import Predictions
 from mvdyn_gtsam.frontend.start import Start, start_from_arrays, start_to_arrays
 from mvdyn_gtsam.frontend.threads import in_order
 from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer, WideBaselineInitializer
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction import CaptureInfo, Reconstruction, ReconstructionWriter
-from mvdyn_gtsam.resuming import RunConfig, configure
+from mvdyn_gtsam.resuming import RunConfig, configure, resumed_prior
 from mvdyn_gtsam.tracking.model import FrameDepth, TrackingResult
 from mvdyn_gtsam.tracking.tracker import Tracker
 
@@ -44,33 +48,39 @@ def reconstruct(
     progress: Progress | None = None,
     flow: DenseFlow | None = None,
     initializer: WideBaselineInitializer | None = None,
+    depth_prior: DepthPrior | None = None,
 ) -> Reconstruction:
     """Recover every camera's pose and depth at every frame and write them to ``out``.
 
     ``stage`` is the last one to run, one of ``STAGES``. ``flow`` and ``initializer`` replace the classical
     measurements; a flow that cannot be pickled needs ``refinement.workers=1``. ``config`` may be nested
-    settings, e.g. ``{"tracking": {"window": 20}}``; the others have their defaults.
+    settings, e.g. ``{"tracking": {"window": 20}}``; the others have their defaults. ``depth_prior`` predicts
+    depth from single images, for tracking; it is asked once for every frame.
 
     With ``resume`` what ``out`` already holds is not computed again, and the run goes on with the settings it
     began with, those of stages to come too. ``config`` may change them for stages that are not finished; of a
     ``Config`` what differs from the defaults counts as asked for. Settings that are new since take their
-    defaults.
+    defaults. A run that began with a depth prior needs it again until tracking is finished.
 
-    Raises TrackingError when nothing can be reconstructed, ResultError when ``out`` cannot be used or a
-    finished stage was made with other settings than ``config`` asks for.
+    Raises TrackingError when nothing can be reconstructed, DepthPriorError when the prior cannot be used or
+    fits no scale of the scene, ResultError when ``out`` cannot be used or a finished stage was made with
+    other settings than ``config`` asks for.
     """
     if stage not in STAGES:
         raise ValueError(f"unknown stage {stage!r}; there are {', '.join(STAGES)}")
     out = Path(out)
     run = configure(out, config, resume=resume)
     config = run.config
+    if isinstance(depth_prior, NoDepthPrior):
+        depth_prior = None
+    prior_name = resumed_prior(out, None if depth_prior is None else depth_prior.name, resume=resume)
     progress = progress if progress is not None else NullProgress()
     flow = flow if flow is not None else DisFlow(config.frontend.flow)
     if initializer is None:
         testimony = DisFlow(testimony_flow(config.frontend.flow))
         initializer = ClassicalInitializer(testimony, config.frontend.wide_baseline)
     writer = ReconstructionWriter.create(
-        out, CaptureInfo.from_capture(capture), to_dict(config), resume=resume
+        out, CaptureInfo.from_capture(capture), to_dict(config), resume=resume, depth_prior=prior_name
     )
     run.log()
     with writer:
@@ -78,7 +88,8 @@ def reconstruct(
             start = _start(capture, initializer, writer, progress)
             writer.set_groups([[capture.cameras[camera].name for camera in group] for group in start.groups])
             _note_groups(capture, start, writer)
-            _track(capture, start, flow, config, writer, progress)
+            with _aligned(depth_prior, capture, start, writer, progress) as prior:
+                _track(capture, start, flow, prior, config, writer, progress)
         if stage == "refinement" and not writer.stage_finished("refinement"):
             _warn_of_new_start(run, writer)
             _refine(capture, flow, config, writer, progress)
@@ -109,17 +120,49 @@ def _note_groups(capture: Capture, start: Start, writer: ReconstructionWriter) -
     writer.add_note(note)
 
 
+@contextmanager
+def _aligned(
+    depth_prior: DepthPrior | None,
+    capture: Capture,
+    start: Start,
+    writer: ReconstructionWriter,
+    progress: Progress,
+) -> Iterator[AlignedPrior | None]:
+    """The prior in the start's scale; what it predicts is kept on disk in the meantime."""
+    if depth_prior is None:
+        yield None
+        return
+    with Predictions(depth_prior, capture.cameras, writer.predictions_folder) as predictions:
+        aligned = align_to_start(predictions, start, capture.read, progress)
+        writer.set_diagnostics(
+            "depth_prior",
+            [
+                {
+                    "cameras": [capture.cameras[camera].name for camera in one.group],
+                    "scale": one.scale_offset.scale,
+                    "offset": one.scale_offset.offset,
+                    "median_error": one.error,
+                }
+                for one in aligned.alignments
+            ],
+        )
+        yield aligned
+
+
 def _track(
     capture: Capture,
     start: Start,
     flow: DenseFlow,
+    prior: AlignedPrior | None,
     config: Config,
     writer: ReconstructionWriter,
     progress: Progress,
 ) -> None:
     """Poses of every frame, then its depth, each written as soon as it is known."""
     began = perf_counter()
-    tracker = Tracker(capture.cameras, start, flow, config, read=capture.read)
+    tracker = Tracker(
+        capture.cameras, start, flow, config, capture.read, None if prior is None else prior.at_grid
+    )
     cameras = range(len(capture.cameras))
     wTc = np.full((len(capture.cameras), capture.frame_count, 4, 4), np.nan)
     try:
@@ -136,7 +179,7 @@ def _track(
             writer.write_trajectory(capture.cameras[camera].name, capture.timestamps, wTc[camera])
     _write_diagnostics(capture, result, writer)
     total = capture.frame_count * len(capture.cameras)
-    jobs = (_depth_job(capture, depth, result, writer) for depth in tracker.frame_depths())
+    jobs = (_depth_job(capture, depth, prior, result, writer) for depth in tracker.frame_depths())
     for done, name in enumerate(in_order(jobs)):
         progress.update("depth", done + 1, total, name)
     writer.finish_stage("tracking", perf_counter() - began)
@@ -223,7 +266,11 @@ def _tracked(capture: Capture, writer: ReconstructionWriter) -> Tracked:
 
 
 def _depth_job(
-    capture: Capture, depth: FrameDepth, result: TrackingResult, writer: ReconstructionWriter
+    capture: Capture,
+    depth: FrameDepth,
+    prior: AlignedPrior | None,
+    result: TrackingResult,
+    writer: ReconstructionWriter,
 ) -> Callable[[], str]:
     """Brings one frame's depth to the input's resolution, writes it and returns its camera's name.
 
@@ -233,12 +280,17 @@ def _depth_job(
     if writer.has_depth(name, depth.time):
         return lambda: name
     image = capture.read(depth.camera, depth.time)
+    log_prior = None if prior is None else prior.dense(depth.camera, depth.time, image)
 
     def write() -> str:
         # Information of a point's log depth is the inverse variance: confidence falls to a half at 5 % error.
         weight = depth.information / (depth.information + 0.05**-2)
         dense, confidence = upsample_depth(
-            image, result.grids[depth.camera], np.exp(depth.log_depth), np.maximum(weight, 1e-6)
+            image,
+            result.grids[depth.camera],
+            np.exp(depth.log_depth),
+            np.maximum(weight, 1e-6),
+            log_prior=log_prior,
         )
         writer.write_depth(name, depth.time, dense, confidence)
         return name

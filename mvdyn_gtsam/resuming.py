@@ -92,6 +92,34 @@ def resumed(saved: Mapping[str, Any], finished: Collection[str], asked: Mapping[
     )
 
 
+def resumed_prior(out: Path, asked: str | None, *, resume: bool) -> str | None:
+    """Name of the depth prior that a run which writes to ``out`` has in the end; ``asked``: that it is given.
+
+    A run that began with a prior goes on with it, and cannot without being given it again; once tracking is
+    finished none is needed. Raises ResultError, naming ``out``.
+    """
+    if not (resume and is_reconstruction(out)):
+        return asked
+    manifest = read_manifest(out)
+    began: str | None = manifest.get("depth_prior")
+    if any(stage["name"] == "tracking" for stage in manifest["stages"]):
+        if asked not in (None, began):
+            raise ResultError(
+                f"{out}: what is finished was made with {_prior(began)}, not {_prior(asked)}; leave that out"
+                " to go on, or start anew in another folder"
+            )
+        return began
+    if asked is None and began is not None:
+        raise ResultError(
+            f"{out}: began with {_prior(began)}; give it again to go on, or start anew in another folder"
+        )
+    return asked
+
+
+def _prior(name: str | None) -> str:
+    return "no depth prior" if name is None else f"the depth prior {name}"
+
+
 def _refuse_other(began: Mapping[str, Any], wanted: Mapping[str, Any], finished: Collection[str]) -> None:
     fixed = {section for stage in finished for section in SECTIONS.get(stage, ())}
     other = [

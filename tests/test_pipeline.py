@@ -20,8 +20,9 @@ from mvdyn_gtsam.capture import load_capture
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import Config, load_config
 from mvdyn_gtsam.demo import demo_capture
-from mvdyn_gtsam.errors import ResultError
+from mvdyn_gtsam.errors import DepthPriorError, ResultError
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, Float32, Image
+from mvdyn_gtsam.frontend.depth_prior import NoDepthPrior
 from mvdyn_gtsam.frontend.start import Start
 from mvdyn_gtsam.geometry import invert_pose, rotation_angle_deg
 from mvdyn_gtsam.pipeline import reconstruct
@@ -352,3 +353,104 @@ def test_a_killed_run_is_resumed_and_runs_repeat_exactly(short_demo: Path, tmp_p
     for name in first.cameras:
         for number in (0, first.frame_count - 1):
             np.testing.assert_allclose(second.depth(name, number), first.depth(name, number), rtol=1e-6)
+
+
+class TruePrior:
+    """The true depth in another unit, shifted; counts what it is asked for."""
+
+    name = "TruePrior"
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.asked: list[tuple[str, int]] = []
+
+    def predict(
+        self, image: np.ndarray, intrinsics: np.ndarray, camera: str, time: int
+    ) -> tuple[np.ndarray, None]:
+        index = [one.name for one in self.scene.cameras].index(camera)
+        np.testing.assert_array_equal(image, self.scene.images[index][time])
+        self.asked.append((camera, time))
+        return (0.4 * self.scene.depths[index][time] + 0.3).astype(np.float32), None
+
+
+@pytest.fixture(scope="module")
+def prior(scene: Scene) -> TruePrior:
+    return TruePrior(scene)
+
+
+@pytest.fixture(scope="module")
+def with_prior(
+    scene: Scene, start: GivenStart, prior: TruePrior, tmp_path_factory: pytest.TempPathFactory
+) -> Reconstruction:
+    out = tmp_path_factory.mktemp("pipeline") / "prior"
+    return reconstruct(scene.capture(), out, config(), stage="tracking", initializer=start, depth_prior=prior)
+
+
+def test_a_depth_prior_gives_better_depth_and_is_asked_once_per_frame(
+    result: Reconstruction, with_prior: Reconstruction, scene: Scene, prior: TruePrior
+) -> None:
+    assert_right(with_prior, scene, position=0.01, rotation=0.1)
+    assert depth_error(with_prior, scene) < 0.7 * depth_error(result.tracked(), scene)
+    assert sorted(prior.asked) == [(name, time) for name in ("cam0", "cam1") for time in range(6)]
+
+
+def test_the_result_tells_of_the_prior_and_keeps_no_prediction(
+    result: Reconstruction, with_prior: Reconstruction
+) -> None:
+    assert with_prior.manifest["depth_prior"] == "TruePrior"
+    assert result.manifest["depth_prior"] is None
+    (fit,) = with_prior.diagnostics("depth_prior")
+    assert fit["cameras"] == ["cam0", "cam1"]
+    assert (fit["scale"], fit["offset"]) == (pytest.approx(2.5, rel=0.05), pytest.approx(-0.75, abs=0.2))
+    assert {path.name for path in with_prior.folder.iterdir()} == {
+        *("manifest.json", "trajectories", "depth", "confidence", "diagnostics")
+    }
+
+
+def test_no_prior_changes_nothing(
+    result: Reconstruction, scene: Scene, start: GivenStart, tmp_path: Path
+) -> None:
+    none = reconstruct(
+        scene.capture(), tmp_path / "out", config(), stage="tracking", initializer=start,
+        depth_prior=NoDepthPrior(),
+    )  # fmt: skip
+    np.testing.assert_array_equal(all_poses(none), all_poses(result.tracked()))
+    np.testing.assert_array_equal(none.depth("cam1", 2), result.tracked().depth("cam1", 2))
+    assert none.manifest["depth_prior"] is None
+
+
+def test_a_stopped_run_goes_on_with_its_prior_and_not_without(
+    with_prior: Reconstruction, scene: Scene, start: GivenStart, tmp_path: Path
+) -> None:
+    capture = scene.capture()
+    with pytest.raises(StoppedError):
+        reconstruct(
+            capture,
+            tmp_path,
+            config(),
+            initializer=start,
+            flow=FlowThatStops(16),
+            depth_prior=TruePrior(scene),
+        )
+    assert not (tmp_path / "predictions").exists()
+    with pytest.raises(ResultError, match="began with the depth prior TruePrior; give it again"):
+        reconstruct(capture, tmp_path, config(), initializer=start, resume=True)
+    finished = reconstruct(
+        capture, tmp_path, stage="tracking", initializer=start, resume=True, depth_prior=TruePrior(scene)
+    )
+    np.testing.assert_array_equal(all_poses(finished), all_poses(with_prior))
+    np.testing.assert_array_equal(finished.depth("cam0", 3), with_prior.depth("cam0", 3))
+
+
+def test_a_prior_that_fits_no_scale_ends_the_run_in_one_line(
+    scene: Scene, start: GivenStart, tmp_path: Path
+) -> None:
+    class Constant(TruePrior):
+        def predict(
+            self, image: np.ndarray, intrinsics: np.ndarray, camera: str, time: int
+        ) -> tuple[np.ndarray, None]:
+            return np.full(image.shape[:2], 2.0), None
+
+    with pytest.raises(DepthPriorError, match="^cam0, cam1: .* cannot be aligned to the start: .* constant"):
+        reconstruct(scene.capture(), tmp_path, config(), initializer=start, depth_prior=Constant(scene))
+    assert Reconstruction.load(tmp_path).status == "failed" and not (tmp_path / "predictions").exists()

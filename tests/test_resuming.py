@@ -12,7 +12,7 @@ from mvdyn_gtsam.config import Config, load_config, to_dict
 from mvdyn_gtsam.config_tree import flatten, nest
 from mvdyn_gtsam.errors import ConfigError, ResultError
 from mvdyn_gtsam.reconstruction import CaptureInfo, ReconstructionWriter
-from mvdyn_gtsam.resuming import DECIDES_NOTHING, SECTIONS, configure, resumed
+from mvdyn_gtsam.resuming import DECIDES_NOTHING, SECTIONS, configure, resumed, resumed_prior
 
 TRACKED = ("start", "tracking")
 REFINED = (*TRACKED, "refinement")
@@ -157,3 +157,38 @@ def test_the_folder_decides_and_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="unknown key"):
         configure(out, {"tracking": {"windw": 20}}, resume=True)
     assert configure(out, None, resume=False).config == Config()
+
+
+def begun(out: Path, prior: str | None, finished: tuple[str, ...]) -> None:
+    """A run with or without a depth prior."""
+    info = CaptureInfo("c", 30.0, 1, ())
+    with ReconstructionWriter.create(out, info, to_dict(Config()), depth_prior=prior) as writer:
+        for stage in finished:
+            writer.finish_stage(stage, 1.0)
+
+
+def test_a_run_with_a_depth_prior_needs_it_until_tracking_is_finished(tmp_path: Path) -> None:
+    begun(tmp_path / "begun", "A", ("start",))
+    with pytest.raises(ResultError, match=r"begun: began with the depth prior A; give it again"):
+        resumed_prior(tmp_path / "begun", None, resume=True)
+    assert resumed_prior(tmp_path / "begun", "A", resume=True) == "A"
+    assert resumed_prior(tmp_path / "begun", "B", resume=True) == "B"  # tracking begins anew, with that
+    begun(tmp_path / "tracked", "A", TRACKED)
+    for asked in (None, "A"):
+        assert resumed_prior(tmp_path / "tracked", asked, resume=True) == "A"
+    with pytest.raises(
+        ResultError, match=r"tracked: .* with the depth prior A, not the depth prior B; leave"
+    ):
+        resumed_prior(tmp_path / "tracked", "B", resume=True)
+
+
+def test_a_run_without_a_depth_prior_takes_one_until_tracking_is_finished(tmp_path: Path) -> None:
+    begun(tmp_path / "begun", None, ("start",))
+    begun(tmp_path / "tracked", None, TRACKED)
+    for name in ("begun", "tracked", "nothing"):
+        assert resumed_prior(tmp_path / name, None, resume=True) is None
+    assert resumed_prior(tmp_path / "begun", "A", resume=True) == "A"
+    with pytest.raises(ResultError, match="with no depth prior, not the depth prior A; leave that out"):
+        resumed_prior(tmp_path / "tracked", "A", resume=True)
+    for name in ("begun", "tracked", "nothing"):
+        assert resumed_prior(tmp_path / name, "A", resume=False) == "A"

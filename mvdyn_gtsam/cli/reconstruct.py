@@ -18,6 +18,7 @@ from mvdyn_gtsam.errors import ResultError
 if TYPE_CHECKING:
     from mvdyn_gtsam.capture import Capture
     from mvdyn_gtsam.config import Config
+    from mvdyn_gtsam.frontend.depth_prior import DepthPrior
     from mvdyn_gtsam.reconstruction import Reconstruction
 
 SUMMARY = "recover every camera's pose and depth for every frame"
@@ -26,7 +27,8 @@ Recover the pose of every camera and a dense depth map for every frame, in one w
 OUT gets manifest.json, trajectories/<camera>.txt (TUM, camera-to-world), depth/ and confidence/.
 Ctrl-C at any time: what is in OUT can be read, and --resume continues, with the settings it began with:
 --set and --config may change those of stages that are not finished; settings that are new since take their
-defaults, and those that are no more are left out with a warning."""
+defaults, and those that are no more are left out with a warning. A run that began with --depth-prior needs it
+again until tracking is finished."""
 EPILOG = """\
 examples:
   mvdyn reconstruct clip --out result
@@ -34,7 +36,8 @@ examples:
                     --camera b.mp4 --intrinsics 810,810,639.5,359.5 --out result
   mvdyn reconstruct clip --out result --stage tracking         # poses and rough depth, in half the time
   mvdyn reconstruct clip --out result --resume                # refine it later
-  mvdyn reconstruct clip --out result --set tracking.window=20"""
+  mvdyn reconstruct clip --out result --set tracking.window=20
+  mvdyn reconstruct clip --out result --depth-prior depth_of_single_images"""
 
 STAGES = ("tracking", "refinement")
 BYTES_PER_PIXEL = 1.0
@@ -50,6 +53,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=STAGES,
         default=STAGES[-1],
         help="last stage to run: poses and rough depth only, or dense depth too (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--depth-prior",
+        type=Path,
+        metavar="FOLDER",
+        help="z-depth of single images, from a network or a sensor: FOLDER/<camera>/000012.npy, (H, W) in any"
+        " unit, or .npz with depth and confidence (0 to 1); 0 or NaN is unknown, and so are frames without a"
+        " file; one scale and offset are found for all",
     )
     add_config_arguments(parser)
     again = parser.add_mutually_exclusive_group()
@@ -72,6 +83,11 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
     refuse_unusable(arguments.out, resume=arguments.resume, overwrite=arguments.overwrite)
     config = configure(arguments.out, settings, resume=arguments.resume).config
     capture = read_capture(arguments, config)
+    depth_prior = None
+    if arguments.depth_prior is not None:
+        from mvdyn_gtsam.frontend.depth_files import DepthFiles
+
+        depth_prior = DepthFiles(arguments.depth_prior, capture.cameras)
     started = time.monotonic()
     result = reconstruct_with_progress(
         capture,
@@ -81,6 +97,7 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
         resume=arguments.resume,
         overwrite=arguments.overwrite,
         messages=messages,
+        depth_prior=depth_prior,
     )
     for line in summary(result, time.monotonic() - started):
         Console(soft_wrap=True, highlight=False, markup=False).print(line)
@@ -96,6 +113,7 @@ def reconstruct_with_progress(
     resume: bool,
     overwrite: bool,
     messages: Console,
+    depth_prior: DepthPrior | None = None,
 ) -> Reconstruction:
     """Say what will be done, do it, show how far it is."""
     for line in announcement(capture, out):
@@ -106,7 +124,9 @@ def reconstruct_with_progress(
     if overwrite and is_reconstruction(out):
         remove_reconstruction(out)
     with ConsoleProgress(messages) as progress:
-        return reconstruct(capture, out, config, stage=stage, resume=resume, progress=progress)
+        return reconstruct(
+            capture, out, config, stage=stage, resume=resume, progress=progress, depth_prior=depth_prior
+        )
 
 
 def announcement(capture: Capture, out: Path) -> list[str]:

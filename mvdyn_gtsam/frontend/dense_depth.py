@@ -27,6 +27,7 @@ def upsample_depth(
     weight: npt.NDArray[np.floating],
     *,
     contrast: float = 20.0,
+    log_prior: Float32 | None = None,
 ) -> tuple[Float32, Float32]:
     """Depth and confidence, ``(H, W) float32``, of grid depths that follow the image's edges.
 
@@ -35,8 +36,37 @@ def upsample_depth(
     and by ``weight (N,)``. Points of ``depth (N,)`` that are not positive and finite, or have no weight, are
     filled in from their neighbours and get a confidence near 0. The depth is finite and within the range
     of the depths given; raises ValueError when none is usable.
+
+    Where ``log_prior (H, W)``, the log depth of a prior, is known (not NaN), the detail between grid points
+    is the prior's: what is brought up is how far the grid is from it.
     """
-    usable = np.isfinite(depth) & (depth > 0.0) & np.isfinite(weight) & (weight > 0.0)
+    plain, confidence = _upsampled(image, grid, depth, weight, contrast)
+    if log_prior is None:
+        return np.exp(plain), confidence
+    prior_at_grid = grid.sample(log_prior)
+    known = np.isfinite(log_prior)
+    if not (np.isfinite(prior_at_grid) & _usable(depth, weight)).any():
+        return np.exp(plain), confidence
+    ratio = np.asarray(depth) / np.exp(prior_at_grid)
+    correction, trust = _upsampled(image, grid, ratio, weight, contrast)
+    log_dense = np.where(known, log_prior + correction, plain)
+    return np.exp(log_dense), np.where(known, trust, confidence)
+
+
+def _usable(depth: npt.NDArray[np.floating], weight: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+    usable: npt.NDArray[np.bool_] = np.isfinite(depth) & (depth > 0.0) & np.isfinite(weight) & (weight > 0.0)
+    return usable
+
+
+def _upsampled(
+    image: npt.NDArray[np.uint8],
+    grid: Grid,
+    depth: npt.NDArray[np.floating],
+    weight: npt.NDArray[np.floating],
+    contrast: float,
+) -> tuple[Float32, Float32]:
+    """Log of ``depth`` and its confidence ``(H, W)``."""
+    usable = _usable(depth, weight)
     if not usable.any():
         raise ValueError("no grid point has a positive depth and weight")
     trust = np.where(usable, np.minimum(weight, 1.0), 0.0).astype(np.float32).reshape(grid.shape)
@@ -44,8 +74,7 @@ def upsample_depth(
     log_depth = filled(log_depth, trust)
     grey = cv2.GaussianBlur(to_grey(image), (0, 0), 1.0).astype(np.float32)
     table = np.stack([log_depth, grid.sample(grey).reshape(grid.shape), trust], axis=-1)
-    log_dense, confidence = _joint_bilateral(grey, grid, table, contrast)
-    return np.exp(log_dense), confidence
+    return _joint_bilateral(grey, grid, table, contrast)
 
 
 def interpolate_sparse_depth(

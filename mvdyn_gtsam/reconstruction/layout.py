@@ -40,6 +40,11 @@ def tracked_folder(folder: Path) -> Path:
     return folder / "tracking"
 
 
+def predictions_folder(folder: Path) -> Path:
+    """Where predictions of a depth prior lie until tracking is done."""
+    return folder / "predictions"
+
+
 def refinement_folder(folder: Path) -> Path:
     """Where a refinement works until it is done."""
     return folder / "refinement"

@@ -21,6 +21,7 @@ from mvdyn_gtsam.reconstruction.layout import (
     confidence_path,
     depth_path,
     motion_path,
+    predictions_folder,
     refinement_folder,
     tracked_folder,
     trajectory_path,
@@ -38,7 +39,7 @@ log = logging.getLogger(__name__)
 
 _OUR_FOLDERS = (
     "trajectories", "depth", "confidence", "motion", "diagnostics", "exports", "pictures", "tracking",
-    "refinement",
+    "refinement", "predictions",
 )  # fmt: skip
 _REPLACED = ("trajectories", "depth", "confidence")
 """What a refinement writes anew; tracking's go to a folder of their own."""
@@ -66,23 +67,28 @@ class ReconstructionWriter:
         resume: bool = False,
         overwrite: bool = False,
         unit: str = "arbitrary",
+        depth_prior: str | None = None,
     ) -> ReconstructionWriter:
         """Open ``folder`` for writing and put its manifest there with status ``running``.
 
-        ``config`` is ``mvdyn_gtsam.config.to_dict(config)``; ``unit`` is "arbitrary" or "metric". With
-        ``resume`` an existing reconstruction of the same capture is continued (what is there stays, but not
-        the depth of a tracking that another ``config`` left unfinished; a folder that does not exist yet is
-        started); ``resuming.resumed`` says which ``config`` goes with what is finished. With ``overwrite``
-        an existing reconstruction is removed first. Raises ResultError when the folder holds anything else.
+        ``config`` is ``mvdyn_gtsam.config.to_dict(config)``; ``unit`` is "arbitrary" or "metric";
+        ``depth_prior`` names the one that tracking uses. With ``resume`` an existing reconstruction of the
+        same capture is continued (what is there stays, but not the depth of a tracking that another
+        ``config`` or prior left unfinished; a folder that does not exist yet is started); ``resuming`` says
+        which of both go with what is finished. With ``overwrite`` an existing reconstruction is removed
+        first. Raises ResultError when the folder holds anything else.
         """
         folder = Path(folder)
         refuse_unusable(folder, resume=resume, overwrite=overwrite)
-        fresh = new_manifest(capture_info, config, unit)
+        fresh = {**new_manifest(capture_info, config, unit), "depth_prior": depth_prior}
         if resume and is_reconstruction(folder):
             manifest = read_manifest(folder)
             _refuse_other_capture(folder, manifest, fresh)
             _remove_outdated(folder, manifest, fresh)
-            manifest.update(status=Status.RUNNING.value, config=fresh["config"], versions=fresh["versions"])
+            manifest.update(
+                status=Status.RUNNING.value,
+                **{key: fresh[key] for key in ("config", "versions", "depth_prior")},
+            )
         else:
             if is_reconstruction(folder):
                 remove_reconstruction(folder)
@@ -157,6 +163,11 @@ class ReconstructionWriter:
         """Whether depth and confidence of that frame are on disk."""
         self._check_frame(camera, time)
         return depth_path(self.folder, camera, time).is_file()
+
+    @property
+    def predictions_folder(self) -> Path:
+        """Where predictions of a depth prior are kept while tracking works."""
+        return predictions_folder(self.folder)
 
     @property
     def refinement_folder(self) -> Path:
@@ -315,7 +326,7 @@ def _remove_outdated(folder: Path, manifest: Mapping[str, Any], fresh: Mapping[s
         {section: values for section, values in one["config"].items() if section != "refinement"}
         for one in (manifest, fresh)
     )
-    if before == now:
+    if before == now and manifest.get("depth_prior") == fresh["depth_prior"]:
         return
     try:
         for name in ("depth", "confidence"):

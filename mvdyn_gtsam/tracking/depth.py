@@ -1,6 +1,9 @@
-"""Depth of a new keyframe on its grid: from sparse points, or carried over from another frame by flow."""
+"""Depth of a new keyframe on its grid: from sparse points, carried over from another frame by flow, or a
+prior's."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -8,6 +11,8 @@ import numpy.typing as npt
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import distance_transform_edt, median_filter
 
+from mvdyn_gtsam.config import TrackingConfig
+from mvdyn_gtsam.frontend.aligned_prior import GridDepth
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.geometry import backproject, invert_pose, transform_points
 from mvdyn_gtsam.tracking.kept_flow import KeptFlow
@@ -16,6 +21,21 @@ Array = npt.NDArray[np.float64]
 
 LIKE_LOG_DEPTH = 0.1
 """Difference of log depth within which neighbours are taken for one surface."""
+PAPER_STRIDE = 8
+"""Pixels to one of those in which the paper measures flow: at 1/8 resolution, as DROID-SLAM does."""
+
+
+@dataclass(frozen=True)
+class DepthBelief:
+    """What is believed of a frame's depth before its own flow says more."""
+
+    log_depth: Array
+    """``(N,)`` where its solution starts."""
+    prior_log_depth: Array
+    """``(N,)`` mean before the scale."""
+    prior_sigma: Array
+    """``(N,)``"""
+    log_scale: float
 
 
 def sparse_log_depth(pixels: Array, depth: Array, grid: Grid) -> Array:
@@ -58,6 +78,44 @@ def carried_log_depth(
         return np.full(len(z), np.median(source_log_depth)), carried
     log_depth = np.log(np.where(carried, z, 1.0))
     return fill(log_depth, carried, grid), carried
+
+
+def prior_information(config: TrackingConfig) -> float:
+    """Inverse variance of log depth that ``depth_prior_lambda`` gives a prior of confidence one.
+
+    The paper's Eq. 4 adds ``w r^2 + lambda (d - D)^2`` with r in pixels of 1/8 resolution and d inverse
+    depth. Ours is ``w r^2 / (2 noise_px^2) + (l - L)^2 / (2 sigma^2)`` with r in pixels and l log depth. At
+    the median depth, which is 1, a change of d is one of l, so both weigh alike where ``1 / sigma^2`` is
+    ``64 lambda / noise_px^2``. Sigma is the same at other depths: errors of a prior grow with depth.
+    """
+    return PAPER_STRIDE**2 * config.depth_prior_lambda / config.noise_px**2
+
+
+def with_prior(
+    log_depth: Array, carried: npt.NDArray[np.bool_], prior: GridDepth, config: TrackingConfig
+) -> DepthBelief:
+    """What carrying (``log_depth (N,)``, which is filled in where not ``carried``) and a prior say together.
+
+    Where something was carried, the solution starts there, and both are believed, each by its information;
+    elsewhere the prior takes the place of what was filled in. The frame's scale is the one on which most of
+    what was carried agrees with the prior. A prior without weight only fills in.
+    """
+    known = np.isfinite(prior.log_depth)
+    both = carried & known
+    scale = float(np.median(log_depth[both] - prior.log_depth[both])) if both.any() else 0.0
+    log_depth = np.where(known & ~carried, prior.log_depth + scale, log_depth)
+    carried_information = config.carried_sigma**-2.0
+    information = np.where(known, prior_information(config) * prior.confidence, 0.0)
+    share = information / (information + carried_information)
+    # nothing would hold a scale of its own where the prior has no weight
+    log_scale = scale if information.any() else 0.0
+    mean = log_depth - log_scale
+    return DepthBelief(
+        log_depth,
+        mean + share * (np.where(known, prior.log_depth, mean) - mean),
+        (carried_information + information) ** -0.5,
+        log_scale,
+    )
 
 
 def smoothed_log_depth(log_depth: Array, information: Array, grid: Grid) -> Array:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from factors.measurement import StructurelessMeasurement
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.config import TrackingConfig
+from mvdyn_gtsam.frontend.aligned_prior import GridDepth
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.geometry import pixel_rays
 from mvdyn_gtsam.graph.connections import EdgeCounts, EdgeKind, Frame
@@ -68,10 +69,12 @@ class Keyframe:
     information: Array
     """``(N,)`` inverse variance of ``log_depth``, poses held fixed."""
     prior_log_depth: Array
-    """``(N,)``"""
+    """``(N,)`` before the scale: carried over, a depth prior's, or both."""
     prior_sigma: Array
     """``(N,)``"""
     log_scale: float = 0.0
+    depth_prior: GridDepth | None = None
+    """A depth prior's word on this frame, in the state's unit."""
     flows: dict[Frame, KeptFlow] = field(default_factory=dict)
     """Flow from this frame to others."""
     guides: dict[Frame, Guide] = field(default_factory=dict)

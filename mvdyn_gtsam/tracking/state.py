@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from time import perf_counter
 
 import gtsam
@@ -15,14 +16,15 @@ from factors.priors import pose_prior, scale_prior
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.config import Config
 from mvdyn_gtsam.errors import TrackingError
+from mvdyn_gtsam.frontend.aligned_prior import GridDepth, PriorAtGrid
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
 from mvdyn_gtsam.frontend.rig import Pair
 from mvdyn_gtsam.frontend.start import Start
 from mvdyn_gtsam.graph.connections import ConnectionGraph, Edge, EdgeKind, Frame
 from mvdyn_gtsam.tracking.connect import inter_camera_edges
-from mvdyn_gtsam.tracking.depth import carried_log_depth
-from mvdyn_gtsam.tracking.images import ImageStore, Read
+from mvdyn_gtsam.tracking.depth import carried_log_depth, with_prior
+from mvdyn_gtsam.tracking.images import Image, ImageStore, Read
 from mvdyn_gtsam.tracking.measure import EdgeMeasurer
 from mvdyn_gtsam.tracking.model import Keyframe, View
 from mvdyn_gtsam.tracking.motion import Correspondences, PoseFit, locate, world_points
@@ -41,7 +43,13 @@ class TrackState:
     """Shared by the steps (``Tracker``) and the end (``finish``); in units of the start's median depth."""
 
     def __init__(
-        self, cameras: Sequence[Camera], start: Start, flow: DenseFlow, config: Config, read: Read | None
+        self,
+        cameras: Sequence[Camera],
+        start: Start,
+        flow: DenseFlow,
+        config: Config,
+        read: Read | None,
+        depth_prior: PriorAtGrid | None = None,
     ) -> None:
         """Raises TrackingError where the start does not fit the cameras."""
         _check_start(cameras, start)
@@ -65,6 +73,7 @@ class TrackState:
         """Of every connection made."""
         self.last_time = -1
         self.seconds: dict[str, float] = {}
+        self._depth_prior = depth_prior
         self._skeleton = [{frame.time: frame for frame in frames} for frames in self.start.frames]
 
     @property
@@ -96,7 +105,7 @@ class TrackState:
         """Depth of ``frame`` from that of a keyframe it has flow to."""
         view = self.views[frame.camera]
         source_view = self.views[source.camera]
-        log_depth, _ = carried_log_depth(
+        log_depth, carried = carried_log_depth(
             frame.flows[source.frame],
             view.grid,
             frame.wTc,
@@ -106,7 +115,26 @@ class TrackState:
             source_view.camera.intrinsics,
             minimum_weight=0.1,
         )
-        frame.log_depth = frame.prior_log_depth = log_depth
+        self.believe(frame, log_depth, carried)
+
+    def believe(self, frame: Keyframe, log_depth: Array, carried: npt.NDArray[np.bool_]) -> None:
+        """Start ``frame`` from ``log_depth (N,)``, filled in where not ``carried``, and its prior."""
+        if frame.depth_prior is None:
+            frame.log_depth = frame.prior_log_depth = log_depth
+            return
+        belief = with_prior(log_depth, carried, frame.depth_prior, self.tracking)
+        frame.log_depth, frame.log_scale = belief.log_depth, belief.log_scale
+        frame.prior_log_depth, frame.prior_sigma = belief.prior_log_depth, belief.prior_sigma
+        frame.information = belief.prior_sigma**-2.0
+
+    def depth_prior(self, camera: int, time: int, image: Image) -> GridDepth | None:
+        """The depth prior's word on a frame, in the state's unit; None without a prior."""
+        if self._depth_prior is None:
+            return None
+        depth = self._depth_prior(camera, time, image, self.views[camera].grid)
+        return (
+            None if depth is None else replace(depth, log_depth=depth.log_depth - np.log(self.unit(camera)))
+        )
 
     def add_edges(self, edges: Sequence[Edge]) -> None:
         """Note connections; measuring them is the caller's."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.config import Config
 from mvdyn_gtsam.errors import TrackingError
+from mvdyn_gtsam.frontend.aligned_prior import GridDepth, PriorAtGrid
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.start import Start, StartFrame
 from mvdyn_gtsam.graph.connections import Edge, EdgeKind, Frame
@@ -35,6 +36,7 @@ class Tracker:
 
     Call ``step`` once per instant, in order and without gaps, then ``finish``. ``read(camera, time)`` hands
     out earlier frames again; without it only frames still held in memory can get new connections.
+    ``depth_prior`` is asked once for every frame, in the unit of the start.
     """
 
     def __init__(
@@ -44,9 +46,10 @@ class Tracker:
         flow: DenseFlow,
         config: Config,
         read: Read | None = None,
+        depth_prior: PriorAtGrid | None = None,
     ) -> None:
         """Raises TrackingError where the start does not fit the cameras."""
-        self.state = TrackState(cameras, start, flow, config, read)
+        self.state = TrackState(cameras, start, flow, config, read, depth_prior)
         self._window = SlidingWindow(self.state.views, config.tracking, self.state.priors)
 
     def step(self, time: int, frames: Sequence[Image]) -> StepReport:
@@ -61,7 +64,7 @@ class Tracker:
         touched: dict[Frame, Keyframe] = {}
         for camera, image in enumerate(frames):
             self.state.images.put((camera, time), image)
-        for candidate in self._candidates(time):
+        for candidate in self._candidates(time, frames):
             if self._is_keyframe(candidate):
                 new.append(candidate)
             else:
@@ -80,19 +83,22 @@ class Tracker:
 
     # ---- one frame -----------------------------------------------------------------------------------
 
-    def _candidates(self, time: int) -> list[Keyframe]:
+    def _candidates(self, time: int, frames: Sequence[Image]) -> list[Keyframe]:
         """The new frames with poses and depths, measured against the last keyframes of their cameras."""
         new: list[Keyframe] = []
         followed: list[tuple[Keyframe, Keyframe, list[Array]]] = []
         for camera, track in enumerate(self.state.tracks):
             predictions = self._predictions(camera, time)
+            prior = self.state.depth_prior(camera, time, frames[camera])
             if not track:
                 sparse = self._nearest_start(camera, time)
                 log_depth = sparse_log_depth(sparse.pixels, sparse.depth, self.state.views[camera].grid)
-                new.append(self._keyframe(camera, time, predictions[0], log_depth))
+                new.append(self._keyframe(camera, time, predictions[0], log_depth, prior))
+                # it is filled in between sparse points
+                self.state.believe(new[-1], log_depth, np.zeros(len(log_depth), bool))
                 continue
             # the depth is only a stand-in until flow says better
-            new.append(self._keyframe(camera, time, predictions[0], track[-1].log_depth))
+            new.append(self._keyframe(camera, time, predictions[0], track[-1].log_depth, prior))
             followed.append((track[-1], new[-1], predictions))
         self.state.measurer.temporal_all([(last, frame) for last, frame, _ in followed])
         # where the flow is guided, the depth must belong to the new view: measured with that once more where
@@ -110,9 +116,11 @@ class Tracker:
             self.state.carry_depth(frame, last)
         return new
 
-    def _keyframe(self, camera: int, time: int, wTc: Array, log_depth: Array) -> Keyframe:
+    def _keyframe(
+        self, camera: int, time: int, wTc: Array, log_depth: Array, prior: GridDepth | None
+    ) -> Keyframe:
         sigma = np.full(len(log_depth), self.state.tracking.carried_sigma)
-        return Keyframe(camera, time, wTc, log_depth, sigma**-2.0, log_depth, sigma)
+        return Keyframe(camera, time, wTc, log_depth, sigma**-2.0, log_depth, sigma, depth_prior=prior)
 
     def _predictions(self, camera: int, time: int) -> list[Array]:
         """Poses to try, the most trusted first: the start's, and constant velocity corrected by tracking."""

@@ -23,6 +23,7 @@ from mvdyn_gtsam.cli.progress import progress_line
 from mvdyn_gtsam.config import Config, to_dict
 from mvdyn_gtsam.demo import demo_capture
 from mvdyn_gtsam.errors import ResultError, TrackingError
+from mvdyn_gtsam.frontend.depth_prior import DepthPrior
 from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.reconstruction import CaptureInfo, Reconstruction, ReconstructionWriter
 from mvdyn_gtsam.resuming import configure
@@ -46,7 +47,14 @@ def begin(capture: Capture, out: Path, config: Settings, resume: bool = False) -
 
 
 def oracle(
-    capture: Capture, out: Path, config: Settings, *, stage: str, resume: bool, progress: Progress
+    capture: Capture,
+    out: Path,
+    config: Settings,
+    *,
+    stage: str,
+    resume: bool,
+    progress: Progress,
+    depth_prior: DepthPrior | None,
 ) -> Reconstruction:
     """Stands in for the pipeline: the true poses, and depth 2 everywhere in every tenth frame."""
     with begin(capture, out, config, resume) as writer:
@@ -190,6 +198,11 @@ def test_no_verb_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
         ),
         (["--camera", "a.mp4", "--out", "{tmp}/o"], "1 cameras but 0 intrinsics"),
         (["--camera", "a.mp4", "--intrinsics", "1,1,1,1", "--out", "{tmp}/o"], "a.mp4"),
+        (
+            ["{demo}", "--out", "{tmp}/o", "--depth-prior", "{tmp}/none"],
+            "none: no such folder; a depth prior is",
+        ),
+        (["{demo}", "--out", "{tmp}/o", "--depth-prior", "{tmp}"], "cam0: is missing; the depth prior needs"),
     ],
 )
 def test_bad_input_is_one_line_exit_1_and_leaves_nothing(
@@ -219,6 +232,28 @@ def test_reconstruct(
     assert code == 1 and "--resume" in only_line(err)
     assert run(capsys, "reconstruct", demo_capture(), "--out", out, "--overwrite")[0] == 0
     assert Reconstruction.load(out).manifest["config"]["tracking"]["window"] == 25
+
+
+def test_a_folder_of_depths_becomes_the_prior(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], use_pipeline: Callable[[Pipeline], None]
+) -> None:
+    taken: list[DepthPrior | None] = []
+
+    def pipeline(*arguments: Any, depth_prior: DepthPrior | None, **options: Any) -> Reconstruction:
+        taken.append(depth_prior)
+        return oracle(*arguments, depth_prior=depth_prior, **options)
+
+    use_pipeline(pipeline)
+    depth = np.linspace(1.0, 2.0, 96 * 128).reshape(96, 128)
+    for name in ("cam0", "cam1"):
+        (tmp_path / "depth" / name).mkdir(parents=True)
+        np.save(tmp_path / "depth" / name / "000003.npy", depth)
+    words = ["reconstruct", demo_capture(), "--out", tmp_path / "o", "--depth-prior", tmp_path / "depth"]
+    assert run(capsys, *words)[0] == 0
+    assert taken[0] is not None
+    found = taken[0].predict(np.zeros((384, 512, 3), np.uint8), np.eye(3), "cam1", 3)
+    assert found is not None and found[0].shape == (384, 512) and found[1] is None
+    assert run(capsys, *words[:-2], "--overwrite")[0] == 0 and taken[1] is None
 
 
 def test_resume_goes_on_with_the_settings_the_run_began_with(

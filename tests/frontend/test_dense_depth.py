@@ -60,6 +60,64 @@ def test_holes_are_filled_from_beside_them_with_little_confidence() -> None:
     assert confidence[:, -8:].max() < 0.05 and confidence[:, :40].min() > 0.9
 
 
+def _plain_image_of_a_thin_thing() -> tuple[np.ndarray, np.ndarray]:
+    """An image without an edge, and a depth with a pole between grid columns that no grid point sees."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    depth = (4.0 + 0.02 * x + 0.01 * y).astype(np.float32)
+    pole = int(GRID.pixels[4, 0]) + 3
+    depth[:, pole : pole + 3] = 1.5
+    return np.full((HEIGHT, WIDTH, 3), 128, np.uint8), depth
+
+
+def test_detail_between_grid_points_is_the_priors() -> None:
+    image, depth = _plain_image_of_a_thin_thing()
+    prior = np.log(0.8 * depth)  # off by a scale, which the grid knows
+    dense, confidence = upsample_depth(
+        image, GRID, GRID.sample(depth), np.ones(len(GRID)), log_prior=prior.astype(np.float32)
+    )
+    np.testing.assert_allclose(dense, depth, rtol=1e-4)
+    np.testing.assert_allclose(confidence, 1.0, atol=1e-5)
+    without, _ = upsample_depth(image, GRID, GRID.sample(depth), np.ones(len(GRID)))
+    assert np.abs(np.log(without / depth)).max() > 0.5
+
+
+def test_what_the_grid_knows_better_bends_the_prior() -> None:
+    image, depth = _plain_image_of_a_thin_thing()
+    bend = 1.0 + 0.005 * np.arange(WIDTH, dtype=np.float32)
+    dense, _ = upsample_depth(
+        image, GRID, GRID.sample(depth), np.ones(len(GRID)), log_prior=np.log(depth / bend)
+    )
+    left, right = int(GRID.pixels[0, 0]), int(GRID.pixels[-1, 0])
+    np.testing.assert_allclose(dense[:, left:right], depth[:, left:right], rtol=2e-3)
+
+
+def test_where_the_prior_is_unknown_all_is_as_without() -> None:
+    image, depth = _step()
+    values, weight = GRID.sample(depth), np.ones(len(GRID))
+    expected, trust = upsample_depth(image, GRID, values, weight)
+    prior = np.log(2.0 * depth)
+    prior[20:50, 30:70] = np.nan
+    dense, confidence = upsample_depth(image, GRID, values, weight, log_prior=prior)
+    unknown = np.isnan(prior)
+    np.testing.assert_array_equal(dense[unknown], expected[unknown])
+    np.testing.assert_array_equal(confidence[unknown], trust[unknown])
+    np.testing.assert_allclose(dense[~unknown], depth[~unknown], rtol=1e-3)
+
+
+def test_a_prior_that_no_grid_point_sees_changes_nothing() -> None:
+    image, depth = _step()
+    values, weight = GRID.sample(depth), np.ones(len(GRID))
+    prior = np.log(2.0 * depth)
+    x, y = GRID.pixels.astype(int).T
+    prior[y, x] = np.nan
+    for expected, found in zip(
+        upsample_depth(image, GRID, values, weight),
+        upsample_depth(image, GRID, values, weight, log_prior=prior),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_nothing_usable_is_refused() -> None:
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     with pytest.raises(ValueError, match="no grid point"):
