@@ -255,7 +255,7 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]
     for label in range(1, int(labels.max()) + 1):
         region = labels == label
         if label not in depths:
-            theta[region] = standing(theta, region)
+            theta[region] = standing(theta, region, labels == 0)
             continue
         matched = np.log(region_depth(instant, region, depths[label].log_inverse_depth))
         moving[region] = depths[label].moving
@@ -271,21 +271,35 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]
     workspace.write("begun", frame, np.exp(theta))
 
 
-def standing(theta: Float32, region: Mask) -> Float32:
+def standing(theta: Float32, region: Mask, still: Mask) -> Float32:
     """Log inverse depth of the pixels of ``region (h, w)`` if it stands on what is below it in the image.
 
-    ``theta (h, w)`` is that of the background, kept where the lower end is not in the image. For things
-    that no other camera sees: most stand on the ground, and most cameras are held upright.
+    ``theta (h, w)`` is that of the background. Where the lower end is not in the image, what is ``still
+    (h, w)`` beside it at the border stands for the ground, which it hides there. For things that no other
+    camera sees: most stand on the ground, and most cameras are held upright.
     """
     rows, columns = np.nonzero(region)
     lowest = int(rows.max())
-    if lowest + GROUND_ROWS >= len(theta):
-        return theta[region]
-    height = lowest - int(rows.min()) + 1
-    feet = np.unique(columns[rows > lowest - max(1, round(FEET * height))])
-    ground = np.median(theta[lowest + 1 : lowest + 1 + GROUND_ROWS, feet])
+    if lowest + GROUND_ROWS < len(theta):
+        height = lowest - int(rows.min()) + 1
+        feet = np.unique(columns[rows > lowest - max(1, round(FEET * height))])
+        ground = np.median(theta[lowest + 1 : lowest + 1 + GROUND_ROWS, feet])
+    else:
+        beside = _beside(columns[rows >= len(theta) - GROUND_ROWS], np.all(still[-GROUND_ROWS:], axis=0))
+        if not len(beside):
+            return theta[region]
+        ground = np.median(theta[-GROUND_ROWS:, beside])
     # nothing stands behind its background
     return np.maximum(theta[region], ground).astype(np.float32)
+
+
+def _beside(columns: npt.NDArray[np.int64], usable: Mask) -> npt.NDArray[np.int64]:
+    """Of the columns ``usable (w,)`` the nearest to those from the least to the greatest of ``columns``, as
+    many as there are in between."""
+    first, last = int(columns.min()), int(columns.max())
+    there = np.flatnonzero(usable)
+    distance = np.maximum(first - there, there - last)
+    return there[np.argsort(distance, kind="stable")[: last - first + 1]]
 
 
 def kept_far_off(moves: Mask) -> Float32:

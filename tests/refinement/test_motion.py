@@ -30,17 +30,30 @@ def floor_and_wall() -> np.ndarray:
 def test_a_thing_stands_where_its_feet_are() -> None:
     theta, region = floor_and_wall(), np.zeros((48, 64), bool)
     region[10:36, 30:34] = True
-    found = standing(theta, region)
+    found = standing(theta, region, ~region)
     np.testing.assert_allclose(found, theta[36:38, 0].mean(), atol=0.03)
 
 
-def test_a_thing_whose_feet_are_outside_keeps_its_background() -> None:
+def test_a_thing_whose_feet_are_outside_hides_the_ground_at_the_border() -> None:
+    """Behind it the floor is unknown, and a box stands by that must not count."""
     theta, region = floor_and_wall(), np.zeros((48, 64), bool)
     region[10:48, 30:34] = True
-    np.testing.assert_array_equal(standing(theta, region), theta[region])
+    ground = theta[46:48, 0].mean()
+    theta[region] = theta[0, 0]
+    box = np.zeros_like(region)
+    box[30:48, 34:40] = True
+    theta[box] += 1.0
+    found = standing(theta, region, ~(region | box))
+    np.testing.assert_allclose(found, ground, atol=0.03)
+
+
+def test_a_thing_that_fills_the_border_keeps_its_background() -> None:
+    theta, region = floor_and_wall(), np.zeros((48, 64), bool)
+    region[10:48] = True
+    np.testing.assert_array_equal(standing(theta, region, ~region), theta[region])
 
 
 def test_nothing_stands_behind_its_background() -> None:
     theta, region = floor_and_wall()[::-1].copy(), np.zeros((48, 64), bool)
     region[4:30, 30:34] = True
-    assert (standing(theta, region) >= theta[region]).all()
+    assert (standing(theta, region, ~region) >= theta[region]).all()
