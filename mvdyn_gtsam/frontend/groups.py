@@ -17,6 +17,8 @@ class Placement:
     second: int
     aSb: Similarity
     verdict: Verdict
+    doubted: bool = False
+    """Whether others came near it, in matches and in dense warping, before any was mended."""
 
 
 Judge = Callable[[int, int, Similarity], float]

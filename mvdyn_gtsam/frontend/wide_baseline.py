@@ -197,18 +197,19 @@ class ClassicalInitializer:
 
         Unless one is clear, those with most in their favour are tried out first.
         """
-        likely = [candidate.placement for candidate in self._likely(capture, first, second, matches)]
-        if self._clear(likely):
-            return likely[:1]
+        likely = self._likely(capture, first, second, matches)
+        if self._clear([candidate.placement for candidate in likely]):
+            return [likely[0].placement]
         found: list[Placement] = []
         enough = -np.inf
-        for placement in likely[: self.config.trial.trials]:
-            if balance(placement.verdict) < enough:
+        for candidate in likely[: self.config.trial.trials]:
+            value = balance(candidate.placement.verdict)
+            if value < enough:
                 break
-            tried = self._tried(capture, first, second, matches, placement)
+            tried = self._tried(capture, first, second, matches, candidate.placement)
             if self._believed(tried.verdict, self.config.minimum_trust):
-                found.append(tried)
-                enough = max(enough, balance(placement.verdict) / NEAR)
+                found.append(replace(tried, doubted=not candidate.alone))
+                enough = max(enough, value / NEAR)
         return found
 
     def _look_again(
@@ -218,29 +219,38 @@ class ClassicalInitializer:
         links: Sequence[Placement],
         matches: Mapping[tuple[int, int], PointMatches],
     ) -> tuple[list[Placement], dict[tuple[int, int], PointMatches], dict[int, DenseMap]]:
-        """Connect groups that ``links`` leave apart by all keypoints with depth, not triangulated ones alone.
+        """Place pairs that ``links`` leave apart, or place in doubt, by all keypoints with depth, not
+        triangulated ones alone.
 
-        Returns further links, the matches with those of the new links, and the maps that took part, whose
+        Returns further links, the matches with those of the new links, and the maps of their cameras, whose
         rows these matches hold.
         """
         more: list[Placement] = []
         pooled = dict(matches)
         lifted: dict[int, DenseMap] = {}
+        used: set[int] = set()
         for a, b in sorted(matches):
+            believed = [link for link in links if (link.first, link.second) == (a, b)]
             groups = connect(list(dense), [*links, *more], self._judge(dense))
-            if any(a in group and b in group for group in groups):
+            together = any(a in group and b in group for group in groups)
+            if together and not any(link.doubted for link in believed):
                 continue
             for camera in (a, b):
                 if camera not in lifted:
                     lifted[camera] = lift_map(capture, dense[camera], self.config.lift, self.config.contrast)
             own = match_lifted(lifted[a], lifted[b], self.config.lift, self.config.placement)
-            found = self._place_lifted(capture, lifted[a], lifted[b], own)
+            found = [
+                placement
+                for placement in self._place_lifted(capture, lifted[a], lifted[b], own)
+                if _is_news(placement, believed)
+            ]
             names = f"{capture.cameras[a].name} - {capture.cameras[b].name}"
             logger.info("%s: %d placements believable on a second look", names, len(found))
             if found:
                 more += found
                 pooled[a, b] = own
-        return more, pooled, lifted
+                used |= {a, b}
+        return more, pooled, {camera: lifted[camera] for camera in used}
 
     def _place_lifted(
         self, capture: Capture, first: DenseMap, second: DenseMap, matches: PointMatches
@@ -330,6 +340,14 @@ class ClassicalInitializer:
             return balance(verdict)
 
         return judge
+
+
+def _is_news(placement: Placement, believed: Sequence[Placement]) -> bool:
+    """Whether more speaks for ``placement`` than for any that is ``believed``, and it is none of them."""
+    return all(
+        balance(placement.verdict) > balance(other.verdict) and not same_placement(placement.aSb, other.aSb)
+        for other in believed
+    )
 
 
 def _with_lone_cameras(capture: Capture, start: Start, views: Mapping[int, StillView]) -> Start:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mvdyn_gtsam.capture import load_capture
 from mvdyn_gtsam.errors import ConfigError
+from mvdyn_gtsam.frontend import wide_baseline
 from mvdyn_gtsam.frontend.dense_flow import DisFlow
 from mvdyn_gtsam.frontend.groups import Placement
 from mvdyn_gtsam.frontend.lifted_points import LiftConfig
@@ -128,6 +131,52 @@ def test_a_second_look_needs_matches_enough_to_place_by(monkeypatch: pytest.Monk
 def test_a_second_look_believes_one_placement_at_most() -> None:
     shifted, true = Verdict(3.0, 0.1, 10, 4.0), Verdict(4.0, 0.1, 10, 4.2)
     assert judged((shifted, False), (true, False)) == [true]
+
+
+def placed(*candidates: tuple[Verdict, bool]) -> list[Placement]:
+    """What the first look believes of two cameras."""
+    nothing = (None,) * 4
+    return Judged(list(candidates))._place(*nothing)  # type: ignore[arg-type]
+
+
+def test_what_others_come_near_to_is_doubted() -> None:
+    best, near, far = (Verdict(a, 0.1, 10, 5.0) for a in (4.0, 3.0, 1.0))
+    assert [link.doubted for link in placed((best, False), (far, False))] == [False]
+    assert [link.doubted for link in placed((best, False), (near, False))] == [True, True]
+    # matches leave no choice
+    assert [link.doubted for link in placed((best, True), (near, False))] == [False, True]
+
+
+ELSEWHERE = Similarity(1.0, np.eye(3), np.array([0.7, 0.0, 0.0]))
+"""One period of a pattern aside."""
+
+
+@pytest.mark.parametrize(
+    ("doubted", "placement", "favour", "taken"),
+    [
+        (True, ELSEWHERE, 4.0, True),
+        (True, ELSEWHERE, 2.0, False),  # less speaks for it
+        (True, Similarity.identity(), 4.0, False),  # nothing new
+        (False, ELSEWHERE, 4.0, False),  # nobody asked
+    ],
+)
+def test_a_placement_in_doubt_gives_way_to_a_better_one_only(
+    monkeypatch: pytest.MonkeyPatch, doubted: bool, placement: Similarity, favour: float, taken: bool
+) -> None:
+    believed = Placement(0, 1, Similarity.identity(), Verdict(2.5, 0.1, 10, 4.0), doubted)
+    better = Placement(0, 1, placement, Verdict(favour, 0.0, 10, 4.2))
+    monkeypatch.setattr(wide_baseline, "lift_map", lambda _, dense, *__: f"lifted {dense}")
+    monkeypatch.setattr(wide_baseline, "match_lifted", lambda *_: "more matches")
+    monkeypatch.setattr(ClassicalInitializer, "_place_lifted", lambda *_: [better])
+    capture = SimpleNamespace(cameras=[SimpleNamespace(name=name) for name in ("cam0", "cam1")])
+    dense: Any = {0: "0", 1: "1"}
+    first_look: Any = {(0, 1): "matches"}
+    start: Any = ClassicalInitializer(DisFlow())
+    more, matches, lifted = start._look_again(capture, dense, [believed], first_look)
+    assert more == ([better] if taken else [])
+    assert matches == {(0, 1): "more matches" if taken else "matches"}
+    # maps that found nothing new stay as they were
+    assert lifted == ({0: "lifted 0", 1: "lifted 1"} if taken else {})
 
 
 @pytest.mark.slow
