@@ -331,3 +331,25 @@ def quick_scene(results: Path, cameras: int = QUICK_CAMERAS, frames: int = QUICK
 def settings_arguments(overrides: Sequence[str]) -> list[str]:
     """``--set KEY=VALUE`` for each, for the command line of `mvdyn reconstruct`."""
     return [word for override in overrides for word in ("--set", override)]
+
+
+def varied_settings(vary: Sequence[str]) -> list[str]:
+    """``key=value`` for every value of ``--vary key=value,value,...``, in their order.
+
+    Raises ExperimentError for a word not of that form, and where nothing is varied.
+    """
+    settings = []
+    for item in vary:
+        key, separator, values = item.partition("=")
+        if not separator or not all(value.strip() for value in values.split(",")):
+            raise ExperimentError(f"--vary {item}: write it as key=value,value,...")
+        settings += [f"{key}={value.strip()}" for value in values.split(",")]
+    if not settings:
+        raise ExperimentError("nothing to vary; give --vary key=value,value,..., `mvdyn config` lists keys")
+    return settings
+
+
+def add_vary(parser: argparse.ArgumentParser) -> None:
+    """``--vary``, for :func:`varied_settings`."""
+    parser.add_argument("--vary", action="append", default=[], metavar="KEY=V1,V2,...",
+                        help="a setting and the values it takes; may be given several times")  # fmt: skip

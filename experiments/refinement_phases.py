@@ -205,9 +205,14 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     result = experiment_parser(NAME, __doc__)
     result.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS)[:3])
-    result.add_argument("--kept", type=Path, metavar="WORK",
-                        help="take the tracking that experiments.accuracy left here")  # fmt: skip
+    add_kept(result)
     return result
+
+
+def add_kept(parser: argparse.ArgumentParser) -> None:
+    """``--kept``, for ``measure``."""
+    parser.add_argument("--kept", type=Path, metavar="WORK",
+                        help="take the tracking that experiments.accuracy left here")  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from experiments.ablations.run import add_timeout, run_study
 from experiments.ablations.studies import FULL, Study, Variant
-from experiments.records import ExperimentError, experiment_parser, parse
+from experiments.records import ExperimentError, add_vary, experiment_parser, parse, varied_settings
 
 NAME = "tracking_sweep"
 QUICK = ("tracking.grid_points=192",)
@@ -25,8 +25,7 @@ QUICK = ("tracking.grid_points=192",)
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     result = experiment_parser(NAME, __doc__)
-    result.add_argument("--vary", action="append", default=[], metavar="KEY=V1,V2,...",
-                        help="a setting and the values it takes; may be given several times")  # fmt: skip
+    add_vary(result)
     result.add_argument("--name", default=NAME, help="of the page (default: %(default)s)")
     add_timeout(result)
     return result
@@ -37,14 +36,7 @@ def study_of(vary: Sequence[str]) -> Study:
 
     Raises ExperimentError for a sweep not of the form key=v1,v2.
     """
-    settings = []
-    for item in vary:
-        key, separator, values = item.partition("=")
-        if not separator or not all(value.strip() for value in values.split(",")):
-            raise ExperimentError(f"--vary {item}: write it as key=value,value,...")
-        settings += [f"{key}={value.strip()}" for value in values.split(",")]
-    if not settings:
-        raise ExperimentError("nothing to vary; give --vary key=value,value,..., `mvdyn config` lists keys")
+    settings = varied_settings(vary)
     return Study(
         NAME,
         "Tracking over values of its settings",

@@ -6,6 +6,7 @@ import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ from mvdyn_gtsam.config import Config, to_dict
 from mvdyn_gtsam.errors import ResultError
 from mvdyn_gtsam.frontend.aligned_prior import AlignedPrior, align_to_start
 from mvdyn_gtsam.frontend.dense_depth import upsample_depth
-from mvdyn_gtsam.frontend.dense_flow import DenseFlow, DisFlow
+from mvdyn_gtsam.frontend.dense_flow import DenseFlow, DisFlow, FlowConfig
 from mvdyn_gtsam.frontend.dense_map import testimony_flow
 from mvdyn_gtsam.frontend.depth_prior import DepthPrior, NoDepthPrior
 from mvdyn_gtsam.frontend.predictions import Predictions
@@ -75,7 +76,7 @@ def reconstruct(
         depth_prior = None
     prior_name = resumed_prior(out, None if depth_prior is None else depth_prior.name, resume=resume)
     progress = progress if progress is not None else NullProgress()
-    flow = flow if flow is not None else DisFlow(config.frontend.flow)
+    tracking_flow = flow if flow is not None else DisFlow(config.frontend.flow)
     if initializer is None:
         testimony = DisFlow(testimony_flow(config.frontend.flow))
         initializer = ClassicalInitializer(testimony, config.frontend.wide_baseline)
@@ -89,10 +90,11 @@ def reconstruct(
             writer.set_groups([[capture.cameras[camera].name for camera in group] for group in start.groups])
             _note_groups(capture, start, writer)
             with _aligned(depth_prior, capture, start, writer, progress) as prior:
-                _track(capture, start, flow, prior, config, writer, progress)
+                _track(capture, start, tracking_flow, prior, config, writer, progress)
         if stage == "refinement" and not writer.stage_finished("refinement"):
             _warn_of_new_start(run, writer)
-            _refine(capture, flow, config, writer, progress)
+            refinement_flow = flow if flow is not None else DisFlow(dense_flow_config(config))
+            _refine(capture, refinement_flow, config, writer, progress)
     return Reconstruction.load(out)
 
 
@@ -196,7 +198,7 @@ def _refine(
     began = perf_counter()
     tracked = _tracked(capture, writer)
     refinement = Refinement(
-        tracked, _workspace(writer), config.refinement, flow, config.frontend.flow, progress
+        tracked, _workspace(writer), config.refinement, flow, dense_flow_config(config), progress
     )
     _announce_refinement(tracked, config, writer)
     names = [camera.name for camera in capture.cameras]
@@ -224,6 +226,11 @@ def _warn_of_new_start(run: RunConfig, writer: ReconstructionWriter) -> None:
     keys = [key for key in run.changed if key.startswith(("refinement.", "frontend.flow."))]
     if keys and _workspace(writer).is_dir():
         logger.warning("the refinement begins anew, its settings are others: %s", ", ".join(keys))
+
+
+def dense_flow_config(config: Config) -> FlowConfig:
+    """Flow settings of the refinement: tracking's, but for how fine it is measured."""
+    return replace(config.frontend.flow, finest_scale=config.refinement.flow_finest_scale)
 
 
 def _workspace(writer: ReconstructionWriter) -> Path:

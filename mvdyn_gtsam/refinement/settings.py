@@ -66,6 +66,9 @@ class RefinementConfig:
     choice."""
     temporal_offsets: tuple[int, ...] = (2, 4, 8)
     """Frame distances of dense temporal edges. Source: paper, "Dense correspondence estimation"."""
+    flow_finest_scale: int = 0
+    """Stands for frontend.flow.finest_scale in the refinement, whose every pixel needs what tracking averages
+    over thousands. Source: experiments/results/refinement_sweep.md."""
     guided_px: float = 16.0
     """Mean predicted flow beyond which flow within a camera is guided by depth and poses. Source: as
     tracking.guided_px."""
@@ -173,6 +176,7 @@ class RefinementConfig:
         for name, low in (
             ("stride", 1), ("workers", 0), ("window", 1), ("overlap", 0), ("rounds", 1),
             ("affine_iterations", 1), ("edges_per_frame", 1), ("depth_iterations", 1), ("pose_iterations", 1),
+            ("flow_finest_scale", 0),
         ):  # fmt: skip
             if getattr(self, name) < low:
                 raise ConfigError(f"refinement.{name} is {getattr(self, name)}; it must be at least {low}")
