@@ -66,11 +66,15 @@ COLUMNS = (
 
 
 def run_key(capture: Path, method: str, stage: str, overrides: Sequence[str]) -> str:
-    """What decides a row's figures; the baselines do not depend on our settings."""
+    """What decides a row's figures; the baselines do not depend on our settings, nor tracking on those of the
+    refinement."""
     name = capture.resolve().name
     if method != OURS:
         return key_of(capture=name, method=method)
-    return key_of(capture=name, method=method, stage=stage, settings=to_dict(load_config(None, overrides)))
+    settings = to_dict(load_config(None, overrides))
+    if stage == "tracking":
+        del settings["refinement"]
+    return key_of(capture=name, method=method, stage=stage, settings=settings)
 
 
 def measure(

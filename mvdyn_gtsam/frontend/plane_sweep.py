@@ -219,21 +219,39 @@ def _correlations(
     epipole = view.intrinsics @ view.jTi[:3, 3]
     x, y = np.arange(width), np.arange(height)[:, None]
     far = [(row[0] * x + row[1] * y + row[2]).astype(np.float32) for row in homography]
+    nearest = min(float(far[2][corner]) for corner in ((0, 0), (0, -1), (-1, 0), (-1, -1)))
     likeness = np.empty((len(ladder), height, width), np.float32)
     for level, inverse_depth in enumerate(ladder):
-        depth = far[2] + np.float32(inverse_depth * epipole[2])
-        front = depth > 1e-6
-        scale = 1.0 / np.where(front, depth, 1.0)
-        u = (far[0] + np.float32(inverse_depth * epipole[0])) * scale
-        v = (far[1] + np.float32(inverse_depth * epipole[1])) * scale
-        visible = front & (u >= 0) & (v >= 0) & (u <= other.shape[1] - 1) & (v <= other.shape[0] - 1)
+        shift = inverse_depth * epipole
+        depth = far[2] + np.float32(shift[2])
+        # depth is linear in the pixel: least at a corner
+        behind = nearest + shift[2] <= 1e-6
+        if behind:
+            depth[depth <= 1e-6] = np.nan
+        u = far[0] + np.float32(shift[0])
+        v = far[1] + np.float32(shift[1])
+        u /= depth
+        v /= depth
+        if behind:
+            u[np.isnan(u)] = -1.0
+            v[np.isnan(v)] = -1.0
+        seen_u, seen_v = cv2.inRange(u, 0.0, other.shape[1] - 1.0), cv2.inRange(v, 0.0, other.shape[0] - 1.0)
         warped = cv2.remap(other, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         there = cv2.blur(warped, size)
-        variance = np.maximum(cv2.sqrBoxFilter(warped, cv2.CV_32F, size) - there * there, 0.0)
-        covariance = cv2.blur(image * warped, size) - mean * there
+        covariance = cv2.blur(image * warped, size)
+        covariance -= mean * there
+        warped *= warped
+        variance = cv2.blur(warped, size)
+        there *= there
+        variance -= there
+        np.maximum(variance, 0.0, out=variance)
+        variance += floor
+        np.sqrt(variance, out=variance)
+        variance *= deviation
+        covariance /= variance
         # correlation below zero is no worse than none: robust against what is hidden
-        correlation = np.maximum(covariance / (deviation * np.sqrt(variance + floor)), 0.0)
-        likeness[level] = np.where(visible, correlation, np.float32(config.unseen))
+        np.maximum(covariance, 0.0, out=likeness[level])
+        likeness[level][cv2.bitwise_and(seen_u, seen_v) == 0] = config.unseen
     return likeness
 
 

@@ -69,6 +69,13 @@ def test_our_settings_decide_our_runs_alone() -> None:
     assert accuracy.run_key(clip, "colmap", "tracking", []) == accuracy.run_key(
         clip, "colmap", "refinement", setting
     )
+    refining = ["refinement.smoothness=2"]
+    assert accuracy.run_key(clip, "ours", "tracking", []) == accuracy.run_key(
+        clip, "ours", "tracking", refining
+    )
+    assert accuracy.run_key(clip, "ours", "refinement", []) != accuracy.run_key(
+        clip, "ours", "refinement", refining
+    )
 
 
 def test_finished_runs_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
