@@ -14,6 +14,7 @@ from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
 from mvdyn_gtsam.batch.clips import Clip, groundtruth_of, has_groundtruth
 from mvdyn_gtsam.batch.report import Row, State
 from mvdyn_gtsam.errors import MvdynError, ResultError
+from mvdyn_gtsam.frontend.depth_files import name_of
 from mvdyn_gtsam.reconstruction import Reconstruction, is_reconstruction
 from mvdyn_gtsam.resuming import resumed
 
@@ -40,6 +41,8 @@ class Plan:
     evaluate: bool = True
     command: tuple[str, ...] = ()
     """In place of ``mvdyn reconstruct``, for tests."""
+    depth_priors: Path | None = None
+    """Folder of the depth priors, one folder per clip."""
 
     @property
     def state_folder(self) -> Path:
@@ -64,6 +67,11 @@ class Plan:
         """What its process said."""
         return self.out / f"{clip.name}.log"
 
+    def depth_prior(self, clip: Clip) -> Path | None:
+        """The depth prior of ``clip``, None where it has none."""
+        folder = None if self.depth_priors is None else self.depth_priors / clip.name
+        return folder if folder is not None and folder.is_dir() else None
+
     def wanted(self) -> bool:
         """Whether the run is still on."""
         return self.run_file.read_text() == self.run
@@ -87,13 +95,15 @@ def reconstruct_clip(clip: Clip, plan: Plan) -> Row:
 
 
 def is_finished(clip: Clip, plan: Plan) -> bool:
-    """Whether the result is there, made with the settings that the plan asks for.
+    """Whether the result is there, made with the settings and the depth prior that the plan asks for.
 
     With others it is not: ``mvdyn reconstruct --resume`` then says what differs.
     """
     if not is_reconstruction(plan.result(clip)):
         return False
-    result = Reconstruction.load(plan.result(clip))
+    result, depth_prior = Reconstruction.load(plan.result(clip)), plan.depth_prior(clip)
+    if depth_prior is not None and result.manifest.get("depth_prior") != name_of(depth_prior):
+        return False
     asked = json.loads(plan.config_file.read_text())
     try:
         resumed(result.manifest["config"], result.stages, asked)
@@ -152,6 +162,8 @@ def _run(clip: Clip, plan: Plan) -> ProcessUsage:
     command = [*(plan.command or (sys.executable, "-m", "mvdyn_gtsam.cli.main", "reconstruct"))]
     command += [str(clip.folder), "--out", str(plan.result(clip)), "--stage", plan.stage, "--resume"]
     command += ["--config", str(plan.config_file)]
+    if (depth_prior := plan.depth_prior(clip)) is not None:
+        command += ["--depth-prior", str(depth_prior)]
     if not json.loads(plan.config_file.read_text()).get("refinement", {}).get("workers"):  # 0 is the default
         command += ["--set", f"refinement.workers={threads}"]
     environment = {**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), str(threads))}

@@ -46,6 +46,9 @@ class BatchSettings:
     """Score what has ground truth."""
     skip_failed: bool = False
     """Leave clips alone that failed in the earlier run."""
+    depth_priors: Path | None = None
+    """Folder with one folder per clip, of its name: depth of its single images. A clip without one has no
+    depth prior."""
     command: tuple[str, ...] = ()
     """In place of ``mvdyn reconstruct``, for tests."""
 
@@ -79,7 +82,9 @@ def run_batch(
         settings.timeout_s,
         settings.evaluate,
         settings.command,
+        None if settings.depth_priors is None else settings.depth_priors.absolute(),
     )
+    _check_depth_priors(clips, plan)
     with _claimed(plan, given_settings(config)):
         earlier = read_rows(plan.out / "batch.json")
         rows = {clip.name: _known(clip, plan, earlier.get(clip.name)) for clip in clips}
@@ -165,6 +170,19 @@ def _is_left(clip: Clip, plan: Plan, row: Row, settings: BatchSettings) -> bool:
     if row.state is State.KEPT:
         return needs_scores(clip, plan, row)
     return not (settings.skip_failed and row.state is State.FAILED)
+
+
+def _check_depth_priors(clips: Sequence[Clip], plan: Plan) -> None:
+    if plan.depth_priors is None:
+        return
+    without = [clip.name for clip in clips if plan.depth_prior(clip) is None]
+    if len(without) == len(clips):
+        raise BatchError(
+            f"{plan.depth_priors}: holds no depth prior; it needs a folder per clip, such as"
+            f" {plan.depth_priors / without[0]}"
+        )
+    if without:
+        logger.warning("%s: no depth prior for %s", plan.depth_priors, ", ".join(without))
 
 
 def _require_evaluation(clips: Sequence[Clip]) -> None:

@@ -41,6 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stage", choices=STAGES, default=STAGES[-1], help="last stage to run (default: %(default)s)"
     )
+    parser.add_argument(
+        "--depth-prior",
+        type=Path,
+        metavar="FOLDER",
+        help="z-depth of single images as for reconstruct: FOLDER/<clip>/<camera>/000012.npy, <clip> as its"
+        " result is named; clips without a folder have none",
+    )
     add_config_arguments(parser)
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
@@ -89,6 +96,7 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
         timeout_s=arguments.timeout,
         evaluate=arguments.evaluate,
         skip_failed=arguments.skip_failed,
+        depth_priors=arguments.depth_prior,
     )
     try:
         with ConsoleProgress(messages) as progress:

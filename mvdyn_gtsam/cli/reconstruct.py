@@ -42,6 +42,8 @@ examples:
 STAGES = ("tracking", "refinement")
 BYTES_PER_PIXEL = 1.0
 """Depth and confidence on disk, measured 0.9 on noisy depth."""
+PREDICTION_BYTES_PER_PIXEL = 8.0
+"""What a depth prior says, kept until tracking is finished: depth and confidence."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -116,7 +118,7 @@ def reconstruct_with_progress(
     depth_prior: DepthPrior | None = None,
 ) -> Reconstruction:
     """Say what will be done, do it, show how far it is."""
-    for line in announcement(capture, out):
+    for line in announcement(capture, out, predicted=depth_prior is not None):
         messages.print(line)
     from mvdyn_gtsam.pipeline import reconstruct
     from mvdyn_gtsam.reconstruction import is_reconstruction, remove_reconstruction
@@ -129,14 +131,23 @@ def reconstruct_with_progress(
         )
 
 
-def announcement(capture: Capture, out: Path) -> list[str]:
-    """What is about to be reconstructed and how much disk it takes."""
+def announcement(capture: Capture, out: Path, predicted: bool = False) -> list[str]:
+    """What is about to be reconstructed and how much disk it takes, with a depth prior that is ``predicted``
+    too.
+
+    Raises ResultError where the disk cannot hold it.
+    """
     sizes = sorted({f"{camera.width}x{camera.height}" for camera in capture.cameras})
     pixels = sum(camera.width * camera.height for camera in capture.cameras) * capture.frame_count
     needed = pixels * BYTES_PER_PIXEL
+    takes = f"the result takes about {needed / 1e6:.0f} MB"
+    if predicted:
+        kept = pixels * PREDICTION_BYTES_PER_PIXEL
+        needed += kept
+        takes += f" and its depth prior up to {kept / 1e6:.0f} MB until tracking is done"
     lines = [
         f"{capture.name}: {len(capture.cameras)} cameras x {capture.frame_count} frames, {', '.join(sizes)},"
-        f" {capture.fps:g} fps; the result takes about {needed / 1e6:.0f} MB in {out}"
+        f" {capture.fps:g} fps; {takes} in {out}"
     ]
     if len(capture.cameras) == 1:
         lines.append("one camera only: its depth rests on its own motion, and what moves is not seen twice")
@@ -144,8 +155,7 @@ def announcement(capture: Capture, out: Path) -> list[str]:
     free = shutil.disk_usage(parent).free
     if free < needed:
         raise ResultError(
-            f"{out}: the result takes about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left;"
-            " free space or choose another --out"
+            f"{out}: {takes}, and the disk has {free / 1e6:.0f} MB left; free space or choose another --out"
         )
     return lines
 

@@ -47,7 +47,7 @@ class DepthFiles:
     @property
     def name(self) -> str:
         """With the folder, so that no run is resumed with another's files."""
-        return f"{type(self).__name__} {self._folder.resolve()}"
+        return name_of(self._folder)
 
     def predict(
         self,
@@ -75,6 +75,11 @@ class DepthFiles:
             _resized(depth, (width, height)),
             None if confidence is None else _resized(confidence, (width, height)),
         )
+
+
+def name_of(folder: Path) -> str:
+    """What a result made with the files of ``folder`` says of its depth prior."""
+    return f"{DepthFiles.__name__} {folder.resolve()}"
 
 
 def _is_frame(path: Path) -> bool:

@@ -126,6 +126,32 @@ def test_failures_stop_nobody_and_a_second_run_does_only_what_is_left(
     assert trace(out, "good") == ["start", "end"]
 
 
+def test_every_clip_is_given_its_depth_prior(
+    tmp_path: Path, settings: BatchSettings, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, out = write_captures(tmp_path / "clips", {"with": {}, "without": {}}), tmp_path / "out"
+    settings = dataclasses.replace(settings, depth_priors=tmp_path / "depths")
+    with pytest.raises(BatchError, match="depths: holds no depth prior"):
+        run_batch(folder, out, settings=settings)
+    (tmp_path / "depths" / "with").mkdir(parents=True)
+    assert states(run_batch(folder, out, settings=settings)) == {"with": "done", "without": "done"}
+    assert f"--depth-prior {tmp_path / 'depths' / 'with'}" in (out / "with.trace").read_text()
+    assert "--depth-prior" not in (out / "without.trace").read_text()
+    assert "no depth prior for without" in caplog.text
+
+
+def test_a_result_without_the_depth_prior_that_is_asked_for_is_not_kept(
+    tmp_path: Path, settings: BatchSettings
+) -> None:
+    folder, out = write_captures(tmp_path / "clips", {"clip": {}}), tmp_path / "out"
+    run_batch(folder, out, settings=settings)
+    (tmp_path / "depths" / "clip").mkdir(parents=True)
+    settings = dataclasses.replace(settings, depth_priors=tmp_path / "depths")
+    report = run_batch(folder, out, settings=settings)
+    # the stand-in cannot write where a result is; mvdyn says what differs
+    assert states(report) == {"clip": "failed"} and trace(out, "clip") == ["start", "end", "start"]
+
+
 def test_an_interrupted_batch_leaves_no_process_and_goes_on(tmp_path: Path, settings: BatchSettings) -> None:
     tasks: dict[str, dict[str, Any]] = {f"clip{n}": {"seconds": 0.0 if n == 0 else 30.0} for n in range(4)}
     folder, out = write_captures(tmp_path / "clips", tasks), tmp_path / "out"

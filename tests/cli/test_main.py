@@ -373,8 +373,16 @@ def test_a_disk_too_small_is_said_before_the_work(
 ) -> None:
     usage = types.SimpleNamespace(total=10, used=9, free=1_000_000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    code, _, err = run(capsys, "reconstruct", demo_capture(), "--out", tmp_path / "o")
+    words = ["reconstruct", demo_capture(), "--out", tmp_path / "o"]
+    code, _, err = run(capsys, *words)
     assert code == 1 and "the disk has 1 MB left" in only_line(err)
+    for name in ("cam0", "cam1"):
+        (tmp_path / "depth" / name).mkdir(parents=True)
+        np.save(tmp_path / "depth" / name / "000003.npy", np.ones((384, 512)))
+    # 2 x 41 x 512 x 384 bytes, and eight times as many of the prior
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(total=0, used=0, free=1e8))
+    code, _, err = run(capsys, *words, "--depth-prior", tmp_path / "depth")
+    assert code == 1 and "16 MB and its depth prior up to 129 MB until tracking is done" in only_line(err)
 
 
 @pytest.fixture
