@@ -24,6 +24,8 @@ Mask = npt.NDArray[np.bool_]
 
 NOTHING = -1000.0
 """Luminance outside an image."""
+ROW = 1024
+"""Pixels are sampled in rows of so many: cv2.remap takes none of 2^15 and more."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,15 @@ def outlined(mask: Mask, around: Mask, grey: Float32, behind: Float32, config: R
 
 def _sampled(image: Float32, at: Float32, outside: float) -> Float32:
     """``(M,)`` of ``image (h, w)`` at pixels ``(M, 2)``."""
+    rows = -(-len(at) // ROW)
+    pixels = np.zeros((rows * ROW, 2), np.float32)
+    pixels[: len(at)] = at
     value = cv2.remap(
-        image, at[None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
+        image,
+        pixels.reshape(rows, ROW, 2),
+        None,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=outside,
     )
-    return np.asarray(value[0], np.float32)
+    return np.asarray(value.ravel()[: len(at)], np.float32)

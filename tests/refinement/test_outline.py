@@ -37,6 +37,18 @@ def test_background_is_what_other_times_see_there() -> None:
     assert np.isnan(alone).any() and np.isfinite(seen).mean() > np.isfinite(alone).mean()
 
 
+def test_background_of_a_large_image_whole() -> None:
+    # an image of a phone: more pixels than OpenCV takes side by side
+    camera = Camera("cam0", 400, 300, 300.0, 300.0, 199.5, 149.5)
+    view, grey = (
+        DenseView.of(camera, 1.0),
+        np.add.outer(np.arange(300.0), np.arange(400.0)).astype(np.float32),
+    )
+    still = OtherTime(grey, np.zeros((300, 400), np.uint8), np.eye(4))
+    seen = background(np.ones(120_000, np.float32), view.rays, view.intrinsics, [still])
+    np.testing.assert_allclose(seen.reshape(300, 400)[1:-1, 1:-1], grey[1:-1, 1:-1], atol=0.1)
+
+
 def test_background_at_the_wrong_depth_is_something_else() -> None:
     seen = background(half(1.0), RAYS, INTRINSICS, [other(4.0), other(4.0)]).reshape(SHAPE)
     assert np.nanmin(np.abs(seen[:, 12:-12] - WALL[:, 12:-12])) > 5.0
