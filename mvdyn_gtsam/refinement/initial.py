@@ -22,6 +22,9 @@ SCORING_EDGES = 6
 """Edges that judge the candidates, those that see most parallax."""
 SURE_WEIGHT = 0.2
 """Weight of flow that may say that something moves: on plain walls flow errs."""
+STILL_VIEWS, STILL_SIDE = 2, 5
+"""Frames that must see a pixel stand still, and side of the least square that does, px of the view. Source:
+as ``RefinementConfig.still_px``."""
 LEAST_PARALLAX_PX = 10.0
 """Motion of a pixel per unit of log depth below which its triangulated depth is no candidate."""
 
@@ -64,6 +67,17 @@ def static_residual(inverse_depth: Float32, edges: Sequence[Edge]) -> Float32:
         residual = terms.residual[sure]
         row[edge.pixels[sure]] = np.hypot(residual[:, 0], residual[:, 1])
     return known_median(table).reshape(inverse_depth.shape)
+
+
+def proven_still(residual: Float32, edges: Sequence[Edge], config: RefinementConfig) -> Mask:
+    """``(h, w)`` where the flow to two frames at least finds things just where they would be if nothing
+    moved; ``residual (h, w)`` is that of ``static_residual``. Without what is thin."""
+    views = np.zeros(residual.size, np.uint8)
+    for edge in edges:
+        views[edge.pixels[edge.weight >= SURE_WEIGHT]] += 1
+    still = (residual < config.still_px) & (views.reshape(residual.shape) >= STILL_VIEWS)
+    kernel = np.ones((STILL_SIDE, STILL_SIDE), np.uint8)
+    return np.asarray(cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0)
 
 
 def known_median(table: Float32) -> Float32:
@@ -111,6 +125,7 @@ def carried_regions(
     own: npt.NDArray[np.uint8],
     edges: Sequence[Edge],
     there: Sequence[npt.NDArray[np.uint8]],
+    beside: Mask,
     stands: npt.NDArray[np.uint8],
     config: RefinementConfig,
 ) -> npt.NDArray[np.uint8]:
@@ -118,13 +133,16 @@ def carried_regions(
 
     As in ``moving_regions``; here nearly all of one side must agree, so that what is found is carried to the
     ends of a video, over pauses, and through moments of even motion; but not where others see a surface that
-    ``stands (h, w)`` there.
+    ``stands (h, w)`` there. Where no edge has flow, what moves too fast for it, ``beside (h, w)`` decides:
+    whether it moves there in the frames next to this one.
     """
-    carried = np.zeros(own.size, bool)
+    carried, found_flow = np.zeros(own.size, bool), np.zeros(own.size, bool)
     for past in (True, False):
         side = [k for k, edge in enumerate(edges) if (edge.j[1] < edge.i[1]) == past]
         votes, count = _votes(own.size, [edges[k] for k in side], [there[k] for k in side])
         carried |= (count > 0.0) & (votes >= config.carried_share * count)
+        found_flow |= count > 0.0
+    carried |= ~found_flow & beside.ravel()
     found = _whole_regions(carried.reshape(own.shape) & (stands == 0), config)
     return np.maximum(own, (found > 0).astype(np.uint8))
 

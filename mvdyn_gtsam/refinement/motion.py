@@ -21,8 +21,15 @@ from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
 from mvdyn_gtsam.refinement.edges import Edge
-from mvdyn_gtsam.refinement.free_space import BEHIND, DepthView, sight, without_outlines
-from mvdyn_gtsam.refinement.initial import carried_regions, closed, moving_regions, regions, static_residual
+from mvdyn_gtsam.refinement.free_space import BEHIND, TRUSTED, DepthView, sight, without_outlines
+from mvdyn_gtsam.refinement.initial import (
+    carried_regions,
+    closed,
+    moving_regions,
+    proven_still,
+    regions,
+    static_residual,
+)
 from mvdyn_gtsam.refinement.moving_depth import (
     InstantView,
     RegionDepth,
@@ -33,8 +40,9 @@ from mvdyn_gtsam.refinement.moving_depth import (
     smooth_over_time,
     standing_still,
 )
-from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
+from mvdyn_gtsam.refinement.outline import OtherTime, background, depth_behind, grown, outlined
 from mvdyn_gtsam.refinement.parts import depth_of_parts
+from mvdyn_gtsam.refinement.views import pixels_seen
 
 Mask = npt.NDArray[np.bool_]
 Labels = npt.NDArray[np.int32]
@@ -133,7 +141,30 @@ def carry_task(context: Context, job: tuple[str, str, Frame]) -> None:
     edges = _near(context, context.edges(frame, context.poses(), own_camera=True))
     there = [np.asarray(workspace.read(source, edge.j)) for edge in edges]
     own, stands = (np.asarray(workspace.read(name, frame)) for name in (source, "stands"))
-    workspace.write(target, frame, carried_regions(own, edges, there, stands, context.config))
+    beside = _seen_beside(context, source, frame) & (context.trust(frame) < TRUSTED)
+    workspace.write(target, frame, carried_regions(own, edges, there, beside, stands, context.config))
+
+
+def _seen_beside(context: Context, name: str, frame: Frame) -> Mask:
+    """Where both the frame before and the one after, of those there are, have the array ``name`` set,
+    ``(h, w)``, if the pixel stood still."""
+    workspace, wTc, (camera, time) = context.workspace, context.poses(), frame
+    times = [t for t in (time - 1, time + 1) if 0 <= t < workspace.frame_count]
+    view = workspace.views[camera]
+    found = np.full(view.shape, len(times) > 0)
+    inverse_depth = np.exp(context.image("first", frame)).ravel()
+    for t in times:
+        jTi = invert_pose(wTc[camera, t]) @ wTc[frame]
+        at, front = pixels_seen(inverse_depth, view.rays, jTi, view.intrinsics)
+        there = cv2.remap(
+            np.asarray(workspace.read(name, (camera, t)), np.uint8),
+            at.reshape(*view.shape, 2),
+            None,
+            cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
+        )
+        found &= (there > 0) & front.reshape(view.shape)
+    return found
 
 
 def _near(context: Context, edges: Sequence[Edge]) -> list[Edge]:
@@ -151,9 +182,13 @@ def settle_task(context: Context, frame: Frame) -> None:
     votes = [np.asarray(workspace.read("fails", edge.j)) for edge in near]
     labels = moving_regions(np.asarray(workspace.read("fails", frame)), near, votes, config)
     # flow that a static depth explains is the best evidence against motion
-    explained = static_residual(np.exp(theta), edges) < config.moving_px
-    explained &= np.asarray(workspace.read("fails", frame)) == 0
+    residual = static_residual(np.exp(theta), edges)
+    explained = (residual < config.moving_px) & (np.asarray(workspace.read("fails", frame)) == 0)
     around = grown(labels > 0, config.moving_reach) & ~explained | (labels > 0)
+    # between things that move, their regions close over what stands there
+    still = proven_still(residual, edges, config)
+    around &= ~still
+    labels[still] = 0
     trust = context.trust(frame)
     trust[around] = 0.0
     # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
@@ -161,7 +196,11 @@ def settle_task(context: Context, frame: Frame) -> None:
     if trust.max() > LEAST_TRUST:
         cubed = filled(np.exp(-3.0 * theta).astype(np.float32), np.maximum(trust, kept_far_off(around)))
         theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
-        labels = _outlined(context, frame, labels > 0, around, theta)
+        if (labels > 0).any():
+            others, view = _other_times(context, frame), workspace.views[frame[0]]
+            behind = depth_behind(around, view.rays, view.intrinsics, others)
+            theta = np.where(np.isfinite(behind), behind, theta)
+            labels = _outlined(context, frame, labels > 0, around, theta, others)
     else:
         # a camera that stands still has no parallax of its own: the others' flow will tell
         theta = np.log(context.image("aligned", frame))
@@ -311,25 +350,31 @@ def kept_far_off(moves: Mask) -> Float32:
     return np.asarray(OWN_SHARE * np.clip(distance / LEAK_REACH - 1.0, 0.0, 1.0), np.float32)
 
 
-def _outlined(context: Context, frame: Frame, moves: Mask, around: Mask, theta: Float32) -> Labels:
-    """Label ``(h, w)`` of the regions that move, with outlines found against what stands behind; ``theta (h,
-    w)`` is that of the background."""
-    if not moves.any():
-        return np.zeros(moves.shape, np.int32)
-    workspace, wTc = context.workspace, context.poses()
-    view, (camera, time) = workspace.views[frame[0]], frame
-    offsets = context.config.background_offsets
-    times = [t for k in offsets for t in (time - k, time + k) if 0 <= t < workspace.frame_count]
-    others = [
+def _other_times(context: Context, frame: Frame) -> list[OtherTime]:
+    """The same camera at the times that are asked what stands behind what moves."""
+    workspace, wTc, config, (camera, time) = context.workspace, context.poses(), context.config, frame
+    times = [t for k in config.background_offsets for t in (time - k, time + k)]
+    return [
         OtherTime(
             grey=context.luminance((camera, t)),
             moves=grown(
-                np.asarray(workspace.read("fails", (camera, t))) > 0, context.config.background_margin
+                np.asarray(workspace.read("fails", (camera, t))) > 0, config.background_margin
             ).astype(np.uint8),
             jTi=invert_pose(wTc[camera, t]) @ wTc[frame],
+            theta=context.image("first", (camera, t)),
+            settled=context.trust((camera, t)) > TRUSTED,
         )
         for t in times
+        if 0 <= t < workspace.frame_count
     ]
+
+
+def _outlined(
+    context: Context, frame: Frame, moves: Mask, around: Mask, theta: Float32, others: Sequence[OtherTime]
+) -> Labels:
+    """Label ``(h, w)`` of the regions that move, with outlines found against what ``others`` see behind them;
+    ``theta (h, w)`` is that of the background."""
+    view = context.workspace.views[frame[0]]
     pixels = np.flatnonzero(around)
     behind = np.full(moves.shape, np.nan, np.float32)
     behind.ravel()[pixels] = background(

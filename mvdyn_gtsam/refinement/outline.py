@@ -1,8 +1,8 @@
 """The outline of what moves: where an image differs from what stands behind it.
 
 Flow is smooth and says where something moves, but not where it ends. What stands behind it is seen at other
-times: its pixels there, found through its depth, have the luminance that this pixel would have if nothing
-stood before it.
+times: they know its depth, and its pixels there, found through that depth, have the luminance that this pixel
+would have if nothing stood before it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.refinement.initial import closed
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import pixels_seen
@@ -38,6 +39,35 @@ class OtherTime:
     """``(h, w)`` 1 where something may move: no background."""
     jTi: Array
     """``(4, 4)``"""
+    theta: Float32
+    """``(h, w)`` log inverse depth."""
+    settled: Mask
+    """``(h, w)`` where that is to be trusted."""
+
+
+def depth_behind(around: Mask, rays: Float32, intrinsics: Array, others: Sequence[OtherTime]) -> Float32:
+    """Log inverse depth ``(h, w)`` of what stands ``around (h, w)``, and behind what moves there.
+
+    The median of the other times that see it, NaN without any. Their points are brought into this view, and
+    of each time the nearest is kept. ``rays (h w, 3)`` and ``intrinsics (3, 3)`` are those of all the views.
+    """
+    height, width = around.shape
+    seen = np.full((len(others), around.size), np.nan, np.float32)
+    for row, other in zip(seen, others, strict=True):
+        still = np.flatnonzero(other.settled & (other.moves == 0))
+        inverse_depth, iTj = np.exp(other.theta.ravel()[still]), invert_pose(other.jTi)
+        at, front = pixels_seen(inverse_depth, rays[still], iTj, intrinsics)
+        column, line = np.rint(at.T)
+        inside = front & (column >= 0) & (line >= 0) & (column < width) & (line < height)
+        pixel = np.where(inside, line * width + column, 0).astype(np.int64)
+        kept = np.flatnonzero(inside & around.ravel()[pixel])
+        pixel, inverse_depth = pixel[kept], inverse_depth[kept]
+        # depth here over depth there
+        ratio = rays[still[kept]] @ iTj[2, :3].astype(np.float32) + inverse_depth * np.float32(iTj[2, 3])
+        here = np.log(inverse_depth / ratio)
+        order = np.argsort(here)  # the nearest is written last, and stays
+        row[pixel[order]] = here[order]
+    return _median(seen).reshape(around.shape)
 
 
 def background(
@@ -54,10 +84,7 @@ def background(
         value = _sampled(other.grey, at, NOTHING)
         free = front & (value > 0.5 * NOTHING) & (_sampled(other.moves.astype(np.float32), at, 1.0) < 0.1)
         row[free] = value[free]
-    result = np.full(len(rays), np.nan, np.float32)
-    known = np.isfinite(seen).any(axis=0)
-    result[known] = np.nanmedian(seen[:, known], axis=0)
-    return result
+    return _median(seen)
 
 
 def grown(mask: Mask, reach: float) -> Mask:
@@ -78,6 +105,14 @@ def outlined(mask: Mask, around: Mask, grey: Float32, behind: Float32, config: R
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     moves = np.asarray(cv2.morphologyEx(moves, cv2.MORPH_CLOSE, kernel), np.uint8)
     return np.asarray(((moves > 0) | (closed(moves, config) > 0) & mask) & around)
+
+
+def _median(seen: Float32) -> Float32:
+    """``(M,)`` of ``seen (K, M)`` without its NaN, NaN where there is nothing else."""
+    result = np.full(seen.shape[1], np.nan, np.float32)
+    known = np.isfinite(seen).any(axis=0)
+    result[known] = np.nanmedian(seen[:, known], axis=0)
+    return result
 
 
 def _sampled(image: Float32, at: Float32, outside: float) -> Float32:

@@ -20,6 +20,7 @@ from mvdyn_gtsam.refinement.initial import (
     failing_regions,
     most_telling,
     moving_regions,
+    proven_still,
     static_residual,
 )
 from mvdyn_gtsam.refinement.residuals import confidence
@@ -219,8 +220,8 @@ def test_what_flows_out_of_the_image_has_no_vote(own_edges: list[Edge]) -> None:
 def carried(edges: list[Edge], block: Mask, seen_by: Callable[[Edge], bool], stands: Mask) -> Mask:
     """Where the static model fails in a frame that saw nothing itself, of a block that some others saw."""
     there = [(block & seen_by(edge)).astype(np.uint8) for edge in edges]
-    own = np.zeros(VIEW.shape, np.uint8)
-    return carried_regions(own, edges, there, stands.astype(np.uint8), CONFIG) > 0
+    own, nowhere = np.zeros(VIEW.shape, np.uint8), np.zeros(VIEW.shape, bool)
+    return carried_regions(own, edges, there, nowhere, stands.astype(np.uint8), CONFIG) > 0
 
 
 def test_what_all_frames_of_one_side_see_move_is_carried(own_edges: list[Edge]) -> None:
@@ -252,7 +253,30 @@ def test_what_others_see_stand_there_is_not_carried(own_edges: list[Edge]) -> No
 
 def test_what_a_frame_sees_itself_stays(own_edges: list[Edge]) -> None:
     own, nothing = square(20, 30, 16).astype(np.uint8), np.zeros(VIEW.shape, np.uint8)
-    assert (carried_regions(own, own_edges, [nothing] * len(own_edges), nothing, CONFIG) == own).all()
+    nowhere, there = nothing > 0, [nothing] * len(own_edges)
+    assert (carried_regions(own, own_edges, there, nowhere, nothing, CONFIG) == own).all()
+
+
+def test_what_is_too_fast_for_flow_moves_where_the_next_frames_see_it(own_edges: list[Edge]) -> None:
+    block, nothing = square(20, 30, 16), np.zeros(VIEW.shape, np.uint8)
+    there = [nothing] * len(own_edges)
+    lost = [replace(edge, weight=edge.weight * ~block.ravel()[edge.pixels]) for edge in own_edges]
+    found = carried_regions(nothing, lost, there, block, nothing, CONFIG) > 0
+    assert found[block].mean() > 0.9 and found[~block].mean() < 0.02
+    # flow that finds it standing still has the say, and so have others who see it stand
+    assert not carried_regions(nothing, own_edges, there, block, nothing, CONFIG).any()
+    assert not carried_regions(nothing, lost, there, block, block.astype(np.uint8), CONFIG).any()
+
+
+def test_what_two_frames_find_where_it_would_be_is_still(own_edges: list[Edge]) -> None:
+    residual = np.where(square(20, 30, 16), 0.5 * CONFIG.still_px, 2.0 * CONFIG.still_px).astype(np.float32)
+    residual[40:43, 10:13] = 0.0  # less than the least square
+    assert (proven_still(residual, own_edges, CONFIG) == square(20, 30, 16)).all()
+    # one frame may err, and so may flow of little weight; unknown is not still
+    unsure = [replace(edge, weight=edge.weight * np.float32(0.9 * SURE_WEIGHT)) for edge in own_edges]
+    for edges in (own_edges[:1], [own_edges[0], *unsure[1:]]):
+        assert not proven_still(residual, edges, CONFIG).any()
+    assert not proven_still(np.full_like(residual, np.nan), own_edges, CONFIG).any()
 
 
 def test_two_blocks_are_two_regions_and_a_speck_is_none() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mvdyn_gtsam.capture.model import Camera
-from mvdyn_gtsam.refinement.outline import OtherTime, background, grown, outlined
+from mvdyn_gtsam.refinement.outline import OtherTime, background, depth_behind, grown, outlined
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView
 
@@ -22,7 +24,8 @@ def other(shift_px: float, moves: np.ndarray | None = None) -> OtherTime:
     jTi = np.eye(4)
     jTi[0, 3] = -shift_px * 2.0 / 50.0
     nothing = np.zeros(SHAPE, np.uint8)
-    return OtherTime(WALL + np.float32(3.0 * shift_px), nothing if moves is None else moves, jTi)
+    grey, moves = WALL + np.float32(3.0 * shift_px), nothing if moves is None else moves
+    return OtherTime(grey, moves, jTi, np.full(SHAPE, -np.log(2.0), np.float32), np.ones(SHAPE, bool))
 
 
 def half(depth: float = 2.0) -> np.ndarray:
@@ -44,7 +47,8 @@ def test_background_of_a_large_image_whole() -> None:
         DenseView.of(camera, 1.0),
         np.add.outer(np.arange(300.0), np.arange(400.0)).astype(np.float32),
     )
-    still = OtherTime(grey, np.zeros((300, 400), np.uint8), np.eye(4))
+    nothing = np.zeros((300, 400), np.uint8)
+    still = OtherTime(grey, nothing, np.eye(4), np.zeros_like(grey), np.ones(grey.shape, bool))
     seen = background(np.ones(120_000, np.float32), view.rays, view.intrinsics, [still])
     np.testing.assert_allclose(seen.reshape(300, 400)[1:-1, 1:-1], grey[1:-1, 1:-1], atol=0.1)
 
@@ -60,6 +64,42 @@ def test_what_moves_at_other_times_is_no_background() -> None:
     seen = background(half(), RAYS, INTRINSICS, [other(0.0, moves), other(0.0, moves)]).reshape(SHAPE)
     assert np.isnan(seen[12:28, 22:38]).all()
     assert np.isfinite(seen[:8]).all()
+
+
+def test_other_times_know_the_depth_behind() -> None:
+    # from 1 m nearer the wall is 1 m away; what moves there, or is not settled, says nothing
+    nearer, moves = np.eye(4), np.zeros(SHAPE, np.uint8)
+    nearer[2, 3], moves[:, :30] = -1.0, 1
+    theta, settled = np.zeros(SHAPE, np.float32), np.zeros(SHAPE, bool)
+    settled[:, 10:50] = True
+    around = np.zeros(SHAPE, bool)
+    around[5:-5, :] = True
+    one = OtherTime(WALL, moves, nearer, theta, settled)
+    found = depth_behind(around, RAYS, INTRINSICS, [one])
+    known = np.isfinite(found)
+    np.testing.assert_allclose(found[known], -np.log(2.0), atol=1e-5)
+    assert known[around].any() and not known[~around].any()
+    # half as large: columns 30 to 49 of it are those from the middle to 39.3 of this one
+    columns = np.flatnonzero(known.any(axis=0))
+    assert columns[0] == 30 and columns[-1] == 39
+    assert not np.isfinite(depth_behind(around, RAYS, INTRINSICS, [])).any()
+
+
+def test_the_nearest_of_what_one_time_sees_there_is_kept() -> None:
+    # a box 1 m away before the left of the wall moves twice as far over the image as the wall does
+    theta = np.full(SHAPE, -np.log(2.0), np.float32)
+    theta[:, :20] = 0.0
+    everywhere = np.ones(SHAPE, bool)
+    view = replace(other(-20.0), theta=theta)
+    found = depth_behind(everywhere, RAYS, INTRINSICS, [view])
+    # to the left, out of the image; to the right, over the wall
+    assert not (np.abs(found) < 0.1).any()
+    found = depth_behind(everywhere, RAYS, INTRINSICS, [replace(other(20.0), theta=theta)])
+    np.testing.assert_allclose(found[:, 41:59], 0.0, atol=1e-5)
+    # of several times the median counts, which no single error moves
+    wrong = replace(other(0.0), theta=np.full(SHAPE, 1.0, np.float32))
+    found = depth_behind(everywhere, RAYS, INTRINSICS, [other(0.0), wrong, other(0.0)])
+    np.testing.assert_allclose(found, -np.log(2.0), atol=1e-5)
 
 
 def test_outline_is_where_the_image_differs() -> None:
