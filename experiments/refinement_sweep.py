@@ -64,9 +64,7 @@ def against_defaults(entries: Entries) -> list[list[str]]:
             if setting_of(entry) == setting and entry["capture"] in plain
         ]
         cells = [figure(_mean_ratio(pairs, key), 3) for _, key in COMPARED]
-        ratios = [a["seconds"] / b["seconds"] for a, b in pairs if a["seconds"] and b["seconds"]]
-        seconds = float(np.exp(np.mean(np.log(ratios)))) if ratios else None
-        rows.append([setting, str(len(pairs)), *cells, figure(seconds, 2)])
+        rows.append([setting, str(len(pairs)), *cells])
     return rows
 
 
@@ -80,14 +78,14 @@ def _mean_ratio(pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], ke
 def render(entries: Entries) -> str:
     """Every setting against the defaults, then one row per run, as Markdown."""
     commits = ", ".join(sorted({str(entry["commit"]) for entry in entries}))
-    headings = ["setting", "captures", *(heading for heading, _ in COMPARED), "s"]
+    headings = ["setting", "captures", *(heading for heading, _ in COMPARED)]
     columns = [column if column != "variant" else "setting" for column in COLUMNS]
     shown = [{**entry, "variant": setting_of(entry)} for entry in entries]
     return (
         f"Each setting alone, the others at their defaults. Commit {commits}.\n"
         "Over the defaults, geometric mean over the captures; below 1 is better:\n\n"
         + table(headings, against_defaults(entries))
-        + "\nEvery run:\n\n"
+        + "\nEvery run; seconds are to be compared between runs under the same load only:\n\n"
         + table(columns, [row(entry) for entry in shown], text_columns=2)
     )
 
