@@ -138,8 +138,9 @@ class RefinementConfig:
     moving pixels showed on a dozen frames of two rendered scenes, in a trial that is not kept."""
     still_px: float = 0.4
     """Residual of the static model below which flow of two frames proves a pixel still, whatever is found
-    around it. Source: on six scenes, two of them crowded, such pixels were 10 to 54 % of what stood still and
-    was called moving, and 0 to 2 % of what moved; with ``moving_px`` 17 to 57 and 0 to 8 %."""
+    around it. Source: on six rendered scenes, two of them crowded, in a trial that is not kept, such pixels
+    were 10 to 54 % of what stood still and was called moving, and 0 to 2 % of what moved; with ``moving_px``
+    17 to 57 and 0 to 8 %."""
     moving_area: float = 0.003
     """Smallest region that may move, as a share of the image. Source: choice."""
     moving_gap: float = 0.06
