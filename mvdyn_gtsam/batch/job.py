@@ -14,7 +14,7 @@ from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
 from mvdyn_gtsam.batch.clips import Clip, groundtruth_of, has_groundtruth
 from mvdyn_gtsam.batch.report import Row, State
 from mvdyn_gtsam.errors import MvdynError, ResultError
-from mvdyn_gtsam.frontend.depth_files import name_of
+from mvdyn_gtsam.frontend.depth_files import depth_files_name
 from mvdyn_gtsam.reconstruction import Reconstruction, is_reconstruction
 from mvdyn_gtsam.resuming import resumed
 
@@ -102,7 +102,7 @@ def is_finished(clip: Clip, plan: Plan) -> bool:
     if not is_reconstruction(plan.result(clip)):
         return False
     result, depth_prior = Reconstruction.load(plan.result(clip)), plan.depth_prior(clip)
-    if depth_prior is not None and result.manifest.get("depth_prior") != name_of(depth_prior):
+    if depth_prior is not None and result.manifest.get("depth_prior") != depth_files_name(depth_prior):
         return False
     asked = json.loads(plan.config_file.read_text())
     try:

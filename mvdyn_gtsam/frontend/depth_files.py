@@ -47,7 +47,7 @@ class DepthFiles:
     @property
     def name(self) -> str:
         """With the folder, so that no run is resumed with another's files."""
-        return name_of(self._folder)
+        return depth_files_name(self._folder)
 
     def predict(
         self,
@@ -77,7 +77,7 @@ class DepthFiles:
         )
 
 
-def name_of(folder: Path) -> str:
+def depth_files_name(folder: Path) -> str:
     """What a result made with the files of ``folder`` says of its depth prior."""
     return f"{DepthFiles.__name__} {folder.resolve()}"
 

@@ -197,10 +197,7 @@ def settle_task(context: Context, frame: Frame) -> None:
         cubed = filled(np.exp(-3.0 * theta).astype(np.float32), np.maximum(trust, kept_far_off(around)))
         theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
         if (labels > 0).any():
-            others, view = _other_times(context, frame), workspace.views[frame[0]]
-            behind = depth_behind(around, view.rays, view.intrinsics, others)
-            theta = np.where(np.isfinite(behind), behind, theta)
-            labels = _outlined(context, frame, labels > 0, around, theta, others)
+            labels, theta = _outlined(context, frame, labels > 0, around, theta)
     else:
         # a camera that stands still has no parallax of its own: the others' flow will tell
         theta = np.log(context.image("aligned", frame))
@@ -370,15 +367,17 @@ def _other_times(context: Context, frame: Frame) -> list[OtherTime]:
 
 
 def _outlined(
-    context: Context, frame: Frame, moves: Mask, around: Mask, theta: Float32, others: Sequence[OtherTime]
-) -> Labels:
-    """Label ``(h, w)`` of the regions that move, with outlines found against what ``others`` see behind them;
-    ``theta (h, w)`` is that of the background."""
-    view = context.workspace.views[frame[0]]
+    context: Context, frame: Frame, moves: Mask, around: Mask, theta: Float32
+) -> tuple[Labels, Float32]:
+    """Label ``(h, w)`` of the regions that move, with outlines found against what other times see behind
+    them, and ``theta (h, w)`` of the background with the depth at which they see it."""
+    view, others = context.workspace.views[frame[0]], _other_times(context, frame)
+    known = depth_behind(around, view.rays, view.intrinsics, others)
+    theta = np.where(np.isfinite(known), known, theta)
     pixels = np.flatnonzero(around)
     behind = np.full(moves.shape, np.nan, np.float32)
     behind.ravel()[pixels] = background(
         np.exp(theta.ravel()[pixels]), view.rays[pixels], view.intrinsics, others
     )
     found = outlined(moves, around, context.luminance(frame), behind, context.config)
-    return regions(found.astype(np.uint8), context.config)
+    return regions(found.astype(np.uint8), context.config), theta

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
-from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, kept_far_off, standing
+from mvdyn_gtsam.capture.model import Camera
+from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
+from mvdyn_gtsam.refinement.context import Context
+from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, carry_task, kept_far_off, standing
+from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.views import DenseView
+from mvdyn_gtsam.refinement.workspace import Workspace
 
 
 def test_depth_is_kept_far_from_what_moves_only() -> None:
@@ -57,3 +65,31 @@ def test_nothing_stands_behind_its_background() -> None:
     theta, region = floor_and_wall()[::-1].copy(), np.zeros((48, 64), bool)
     region[4:30, 30:34] = True
     assert (standing(theta, region, ~region) >= theta[region]).all()
+
+
+def test_what_is_too_fast_for_flow_is_carried_from_the_next_frames(tmp_path: Path) -> None:
+    # one camera that stands still and has no flow at all; a block moves in frames 1 and 2
+    view = DenseView.of(Camera("cam0", 64, 48, 60.0, 60.0, 31.5, 23.5), 1.0)
+    workspace = Workspace(tmp_path, (view,), 5)
+    workspace.prepare("test")
+    for name in ("first", "information"):
+        workspace.create(name)
+    for name in ("fails", "carried", "stands"):
+        workspace.create(name, np.uint8)
+    block = np.zeros(view.shape, np.uint8)
+    block[10:30, 20:40] = 1
+    for time in (1, 2):
+        workspace.write("fails", (0, time), block)
+    workspace.write_array("poses", np.tile(np.eye(4), (1, 5, 1, 1)))
+    context = Context(workspace, ((0,),), {}, RefinementConfig(stride=1), DisFlow(), FlowConfig())
+
+    def carried(time: int) -> np.ndarray:
+        carry_task(context, ("fails", "carried", (0, time)))
+        return np.asarray(workspace.read("carried", (0, time))) > 0
+
+    # the first frame has one neighbour, which sees it move; frame 3 has another that does not
+    assert carried(0)[block > 0].mean() > 0.9 and carried(0)[block == 0].mean() < 0.02
+    assert not carried(3).any() and not carried(4).any()
+    # a depth that flow settles stands, whatever the neighbours see
+    workspace.write("information", (0, 0), np.full(view.shape, 1e6, np.float32))
+    assert not carried(0).any()
