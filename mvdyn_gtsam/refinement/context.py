@@ -12,9 +12,11 @@ from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.edges import Edge, load_edges
 from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
 Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
 
 TRUSTED_SIGMA = 0.05
 """Standard deviation of log depth at which a pixel's depth counts half as its own and half as its
@@ -23,6 +25,10 @@ surroundings'."""
 STATIC, MOVING, UNEXPLAINED = 0, 1, 2
 """Of the array ``moving``: nothing moves; it moves and the views of its instant tell its depth; they do
 not."""
+
+
+COLOUR = "colour differences"
+"""The array of what ``colour_differences`` finds."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +69,32 @@ class Context:
     def luminance(self, frame: Frame) -> Float32:
         """``(h, w)`` without the noise of single pixels."""
         grey = np.asarray(self.workspace.read("grey", frame), np.uint8)
-        small = self.workspace.views[frame[0]].shrink(cv2.GaussianBlur(grey, (0, 0), 1.0))
-        return np.asarray(small, np.float32)
+        return np.asarray(_smooth(grey, self.workspace.views[frame[0]]), np.float32)
+
+    def colour(self, frame: Frame) -> Float32:
+        """``(h, w, 3)``: luminance and the two differences of colour, grey levels, likewise."""
+        differences = np.asarray(self.workspace.read(COLOUR, frame), np.float32)
+        return np.dstack([self.luminance(frame), differences])
 
     def trust(self, frame: Frame) -> Float32:
         """``(h, w)`` in [0, 1], how far the flow settles the depth solved last."""
         return trust_of(self.image("information", frame))
+
+
+def colour_differences(image: Image, view: DenseView) -> Image:
+    """``(h, w, 2)``: by how much a grey or RGB image ``(H, W[, 3])`` is redder and bluer than grey, 128 where
+    it is not, without the noise of single pixels.
+
+    Cr and Cb of JPEG (https://www.w3.org/Graphics/JPEG/jfif3.pdf): a change of either is as large as one of
+    luminance.
+    """
+    if image.ndim == 2:
+        return np.full((*view.shape, 2), 128, np.uint8)
+    return np.asarray(cv2.cvtColor(_smooth(image, view), cv2.COLOR_RGB2YCrCb)[..., 1:], np.uint8)
+
+
+def _smooth(image: Image, view: DenseView) -> Image:
+    return np.asarray(view.shrink(cv2.GaussianBlur(image, (0, 0), 1.0)), np.uint8)
 
 
 def trust_of(information: Float32) -> Float32:

@@ -353,7 +353,7 @@ def _other_times(context: Context, frame: Frame) -> list[OtherTime]:
     times = [t for k in config.background_offsets for t in (time - k, time + k)]
     return [
         OtherTime(
-            grey=context.luminance((camera, t)),
+            colour=context.colour((camera, t)),
             moves=grown(
                 np.asarray(workspace.read("fails", (camera, t))) > 0, config.background_margin
             ).astype(np.uint8),
@@ -375,9 +375,9 @@ def _outlined(
     known = depth_behind(around, view.rays, view.intrinsics, others)
     theta = np.where(np.isfinite(known), known, theta)
     pixels = np.flatnonzero(around)
-    behind = np.full(moves.shape, np.nan, np.float32)
-    behind.ravel()[pixels] = background(
+    behind = np.full((*moves.shape, 3), np.nan, np.float32)
+    behind.reshape(-1, 3)[pixels] = background(
         np.exp(theta.ravel()[pixels]), view.rays[pixels], view.intrinsics, others
     )
-    found = outlined(moves, around, context.luminance(frame), behind, context.config)
+    found = outlined(moves, around, context.colour(frame), behind, context.config)
     return regions(found.astype(np.uint8), context.config), theta

@@ -1,7 +1,7 @@
 """The outline of what moves: where an image differs from what stands behind it.
 
 Flow is smooth and says where something moves, but not where it ends. What stands behind it is seen at other
-times: they know its depth, and its pixels there, found through that depth, have the luminance that this pixel
+times: they know its depth, and its pixels there, found through that depth, have the colour that this pixel
 would have if nothing stood before it.
 """
 
@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 NOTHING = -1000.0
-"""Luminance outside an image."""
+"""Colour outside an image."""
 ROW = 1024
 """Pixels are sampled in rows of so many: cv2.remap takes none of 2^15 and more."""
 
@@ -33,8 +33,8 @@ ROW = 1024
 class OtherTime:
     """The same camera at another time."""
 
-    grey: Float32
-    """``(h, w)``"""
+    colour: Float32
+    """``(h, w, 3)``"""
     moves: npt.NDArray[np.uint8]
     """``(h, w)`` 1 where something may move: no background."""
     jTi: Array
@@ -73,18 +73,18 @@ def depth_behind(around: Mask, rays: Float32, intrinsics: Array, others: Sequenc
 def background(
     inverse_depth: Float32, rays: Float32, intrinsics: Array, others: Sequence[OtherTime]
 ) -> Float32:
-    """Luminance ``(M,)`` of what stands at ``inverse_depth (M,)`` along ``rays (M, 3)``.
+    """Colour ``(M, 3)`` of what stands at ``inverse_depth (M,)`` along ``rays (M, 3)``.
 
     The median of the other times that see it, NaN without any. ``intrinsics (3, 3)`` are those of the
     images.
     """
-    seen = np.full((len(others), len(rays)), np.nan, np.float32)
+    seen = np.full((len(others), len(rays), 3), np.nan, np.float32)
     for row, other in zip(seen, others, strict=True):
         at, front = pixels_seen(inverse_depth, rays, other.jTi, intrinsics)
-        value = _sampled(other.grey, at, NOTHING)
-        free = front & (value > 0.5 * NOTHING) & (_sampled(other.moves.astype(np.float32), at, 1.0) < 0.1)
+        value = _sampled(other.colour, at, NOTHING)
+        free = front & (value[:, 0] >= 0.0) & (_sampled(other.moves.astype(np.float32), at, 1.0) < 0.1)
         row[free] = value[free]
-    return _median(seen)
+    return _median(seen.reshape(len(others), -1)).reshape(-1, 3)
 
 
 def grown(mask: Mask, reach: float) -> Mask:
@@ -93,11 +93,14 @@ def grown(mask: Mask, reach: float) -> Mask:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0)
 
 
-def outlined(mask: Mask, around: Mask, grey: Float32, behind: Float32, config: RefinementConfig) -> Mask:
-    """Pixels of ``around (h, w)`` that differ from what stands ``behind (h, w)`` them; where that is NaN,
-    those of ``mask (h, w)``. Of ``mask`` also the gaps between these, which only look like the background."""
-    known = np.isfinite(behind) & around
-    difference = np.where(known, np.abs(grey - behind), 0.0).astype(np.float32)
+def outlined(mask: Mask, around: Mask, colour: Float32, behind: Float32, config: RefinementConfig) -> Mask:
+    """Pixels of ``around (h, w)`` whose ``colour (h, w, 3)`` differs from what stands ``behind`` them; where
+    that is NaN, those of ``mask (h, w)``.
+
+    Of ``mask`` also the gaps between these, which only look like the background.
+    """
+    known = np.isfinite(behind[..., 0]) & around
+    difference = np.where(known, np.linalg.norm(colour - behind, axis=2), 0.0).astype(np.float32)
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.0)
     difference = cv2.GaussianBlur(difference, (0, 0), 1.0) / np.maximum(weight, 1e-3)
     moves = np.where(known, difference > config.moving_contrast, mask & around).astype(np.uint8)
@@ -116,7 +119,7 @@ def _median(seen: Float32) -> Float32:
 
 
 def _sampled(image: Float32, at: Float32, outside: float) -> Float32:
-    """``(M,)`` of ``image (h, w)`` at pixels ``(M, 2)``."""
+    """``(M[, C])`` of ``image (h, w[, C])`` at pixels ``(M, 2)``."""
     rows = -(-len(at) // ROW)
     pixels = np.zeros((rows * ROW, 2), np.float32)
     pixels[: len(at)] = at
@@ -126,6 +129,6 @@ def _sampled(image: Float32, at: Float32, outside: float) -> Float32:
         None,
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
-        borderValue=outside,
+        borderValue=(outside,) * 4,
     )
-    return np.asarray(value.ravel()[: len(at)], np.float32)
+    return np.asarray(value.reshape(-1, *image.shape[2:])[: len(at)], np.float32)

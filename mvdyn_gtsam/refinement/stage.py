@@ -21,7 +21,7 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, to_grey
 from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_pairs
-from mvdyn_gtsam.refinement.context import Context
+from mvdyn_gtsam.refinement.context import COLOUR, Context, colour_differences
 from mvdyn_gtsam.refinement.motion import LABELS, depth_of_regions
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
@@ -39,8 +39,8 @@ Array = npt.NDArray[np.float64]
 
 BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
-BYTES_PER_PIXEL = 58.0
-"""Of a view on disk besides its flow: thirteen arrays of 32 bits and six of 8."""
+BYTES_PER_PIXEL = 60.0
+"""Of a view on disk besides its flow: thirteen arrays of 32 bits and eight of 8."""
 FAILS, CARRIED = "fails", "carried"
 """The arrays of where the static model fails that ``carry`` reads and writes in turn."""
 CARRY_ROUNDS = 4
@@ -191,6 +191,7 @@ class Refinement:
     def _store_images(self) -> None:
         workspace, tracked = self._workspace, self._tracked
         workspace.create("grey", np.uint8, full_size=True)
+        workspace.create(COLOUR, np.uint8, channels=(2,))
         workspace.create("moving", np.uint8)
         for name in (FAILS, CARRIED, "stands", "held"):
             workspace.create(name, np.uint8)
@@ -202,7 +203,9 @@ class Refinement:
             workspace.create(name)
         for done, frame in enumerate(self._frames):
             view = workspace.views[frame[0]]
-            workspace.write("grey", frame, to_grey(tracked.read(*frame)))
+            image = tracked.read(*frame)
+            workspace.write("grey", frame, to_grey(image))
+            workspace.write(COLOUR, frame, colour_differences(image, view))
             depth, confidence = tracked.depth(*frame)
             inverse = np.asarray(view.shrink(1.0 / _without_holes(depth)), np.float32)
             trust = np.asarray(view.shrink(np.where(np.isfinite(depth), confidence, 0.0)), np.float32)

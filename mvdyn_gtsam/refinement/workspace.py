@@ -7,6 +7,7 @@ finished, so that a killed run goes on where it was.
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -48,17 +49,17 @@ class _Layout:
     """Of the file of an array."""
 
     header_bytes: int
-    shape: tuple[int, int]
-    """``(h, w)`` of one image."""
+    shape: tuple[int, ...]
+    """``(h, w)`` or ``(h, w, channels)`` of one image."""
     dtype: np.dtype[np.generic]
 
     @property
-    def pixels(self) -> int:
-        return self.shape[0] * self.shape[1]
+    def numbers(self) -> int:
+        return math.prod(self.shape)
 
     def start(self, time: int) -> int:
         """Byte at which an image begins."""
-        return self.header_bytes + time * self.pixels * self.dtype.itemsize
+        return self.header_bytes + time * self.numbers * self.dtype.itemsize
 
 
 class Workspace:
@@ -98,10 +99,13 @@ class Workspace:
             temporary.write_text(json.dumps([*self.finished(), step]))
             temporary.replace(self.folder / JOURNAL)
 
-    def create(self, name: str, dtype: type = np.float32, full_size: bool = False) -> None:
-        """Make an array per camera, one image per frame, filled with zeros."""
+    def create(
+        self, name: str, dtype: type = np.float32, full_size: bool = False, channels: tuple[int, ...] = ()
+    ) -> None:
+        """Make an array per camera, one image per frame, filled with zeros; ``channels`` are the lengths of
+        its axes besides height and width."""
         for camera, view in enumerate(self.views):
-            shape = (view.camera.height, view.camera.width) if full_size else view.shape
+            shape = ((view.camera.height, view.camera.width) if full_size else view.shape) + channels
             path = self._path(name, camera)
             if not path.is_file():
                 with _writing(path):
@@ -111,8 +115,8 @@ class Workspace:
         """One image of an array."""
         path = self._path(name, frame[0])
         layout = self._layout(path)
-        pixels = np.fromfile(path, layout.dtype, layout.pixels, offset=layout.start(frame[1]))
-        return pixels.reshape(layout.shape)
+        numbers = np.fromfile(path, layout.dtype, layout.numbers, offset=layout.start(frame[1]))
+        return numbers.reshape(layout.shape)
 
     def write(self, name: str, frame: Frame, image: npt.NDArray[np.generic]) -> None:
         """Set one image of an array."""
@@ -139,7 +143,7 @@ class Workspace:
             with path.open("rb") as file:
                 np.lib.format.read_magic(file)
                 shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-                self._layouts[path] = _Layout(file.tell(), (shape[1], shape[2]), dtype)
+                self._layouts[path] = _Layout(file.tell(), shape[1:], dtype)
         return self._layouts[path]
 
     def _path(self, name: str, camera: int) -> Path:

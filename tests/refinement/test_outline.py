@@ -19,13 +19,20 @@ WALL = (100.0 + 3.0 * np.arange(60, dtype=np.float32) + np.zeros((40, 1), np.flo
 """A wall 2 m away, brighter to the right; it is plain along a column."""
 
 
+def coloured(grey: np.ndarray) -> np.ndarray:
+    """``(h, w, 3)`` of a grey image."""
+    return np.dstack([grey, *np.full((2, *grey.shape), 128.0)]).astype(np.float32)
+
+
 def other(shift_px: float, moves: np.ndarray | None = None) -> OtherTime:
     """The wall, seen after the camera moved to the right by ``shift_px`` of the wall's image."""
     jTi = np.eye(4)
     jTi[0, 3] = -shift_px * 2.0 / 50.0
     nothing = np.zeros(SHAPE, np.uint8)
     grey, moves = WALL + np.float32(3.0 * shift_px), nothing if moves is None else moves
-    return OtherTime(grey, moves, jTi, np.full(SHAPE, -np.log(2.0), np.float32), np.ones(SHAPE, bool))
+    return OtherTime(
+        coloured(grey), moves, jTi, np.full(SHAPE, -np.log(2.0), np.float32), np.ones(SHAPE, bool)
+    )
 
 
 def half(depth: float = 2.0) -> np.ndarray:
@@ -33,10 +40,10 @@ def half(depth: float = 2.0) -> np.ndarray:
 
 
 def test_background_is_what_other_times_see_there() -> None:
-    seen = background(half(), RAYS, INTRINSICS, [other(4.0), other(-4.0)]).reshape(SHAPE)
-    np.testing.assert_allclose(seen[:, 1:-1], WALL[:, 1:-1], atol=1e-2)
+    seen = background(half(), RAYS, INTRINSICS, [other(4.0), other(-4.0)]).reshape(*SHAPE, 3)
+    np.testing.assert_allclose(seen[:, 1:-1], coloured(WALL)[:, 1:-1], atol=1e-2)
     # only one of the two sees the outermost columns, which is enough
-    alone = background(half(), RAYS, INTRINSICS, [other(4.0)]).reshape(SHAPE)
+    alone = background(half(), RAYS, INTRINSICS, [other(4.0)])
     assert np.isnan(alone).any() and np.isfinite(seen).mean() > np.isfinite(alone).mean()
 
 
@@ -48,20 +55,20 @@ def test_background_of_a_large_image_whole() -> None:
         np.add.outer(np.arange(300.0), np.arange(400.0)).astype(np.float32),
     )
     nothing = np.zeros((300, 400), np.uint8)
-    still = OtherTime(grey, nothing, np.eye(4), np.zeros_like(grey), np.ones(grey.shape, bool))
+    still = OtherTime(coloured(grey), nothing, np.eye(4), np.zeros_like(grey), np.ones(grey.shape, bool))
     seen = background(np.ones(120_000, np.float32), view.rays, view.intrinsics, [still])
-    np.testing.assert_allclose(seen.reshape(300, 400)[1:-1, 1:-1], grey[1:-1, 1:-1], atol=0.1)
+    np.testing.assert_allclose(seen[:, 0].reshape(300, 400)[1:-1, 1:-1], grey[1:-1, 1:-1], atol=0.1)
 
 
 def test_background_at_the_wrong_depth_is_something_else() -> None:
-    seen = background(half(1.0), RAYS, INTRINSICS, [other(4.0), other(4.0)]).reshape(SHAPE)
+    seen = background(half(1.0), RAYS, INTRINSICS, [other(4.0), other(4.0)])[:, 0].reshape(SHAPE)
     assert np.nanmin(np.abs(seen[:, 12:-12] - WALL[:, 12:-12])) > 5.0
 
 
 def test_what_moves_at_other_times_is_no_background() -> None:
     moves = np.zeros(SHAPE, np.uint8)
     moves[10:30, 20:40] = 1
-    seen = background(half(), RAYS, INTRINSICS, [other(0.0, moves), other(0.0, moves)]).reshape(SHAPE)
+    seen = background(half(), RAYS, INTRINSICS, [other(0.0, moves), other(0.0, moves)]).reshape(*SHAPE, 3)
     assert np.isnan(seen[12:28, 22:38]).all()
     assert np.isfinite(seen[:8]).all()
 
@@ -74,7 +81,7 @@ def test_other_times_know_the_depth_behind() -> None:
     settled[:, 10:50] = True
     around = np.zeros(SHAPE, bool)
     around[5:-5, :] = True
-    one = OtherTime(WALL, moves, nearer, theta, settled)
+    one = OtherTime(coloured(WALL), moves, nearer, theta, settled)
     found = depth_behind(around, RAYS, INTRINSICS, [one])
     known = np.isfinite(found)
     np.testing.assert_allclose(found[known], -np.log(2.0), atol=1e-5)
@@ -108,17 +115,27 @@ def test_outline_is_where_the_image_differs() -> None:
     grey = np.where(true, WALL - np.float32(40.0), WALL)
     fat = grown(true, CONFIG.moving_reach)
     around = grown(fat, CONFIG.moving_reach)
-    found = outlined(fat, around, grey, WALL, CONFIG)
+    found = outlined(fat, around, coloured(grey), coloured(WALL), CONFIG)
     # at most a pixel of blur all around
     assert np.count_nonzero(found ^ true) < 74
     assert np.count_nonzero(fat ^ true) > 3 * np.count_nonzero(found ^ true)
 
 
+def test_outline_of_what_differs_in_colour_alone() -> None:
+    true = np.zeros(SHAPE, bool)
+    true[10:30, 20:35] = True
+    colour = coloured(WALL)
+    colour[true, 1] += 30.0
+    fat = grown(true, CONFIG.moving_reach)
+    found = outlined(fat, grown(fat, CONFIG.moving_reach), colour, coloured(WALL), CONFIG)
+    assert np.count_nonzero(found ^ true) < 74
+
+
 def test_unknown_background_leaves_the_mask() -> None:
     mask = np.zeros(SHAPE, bool)
     mask[10:30, 20:35] = True
-    unknown = np.full(SHAPE, np.nan, np.float32)
-    found = outlined(mask, grown(mask, CONFIG.moving_reach), WALL, unknown, CONFIG)
+    unknown = np.full((*SHAPE, 3), np.nan, np.float32)
+    found = outlined(mask, grown(mask, CONFIG.moving_reach), coloured(WALL), unknown, CONFIG)
     assert np.count_nonzero(found ^ mask) < 0.05 * np.count_nonzero(mask)
 
 
@@ -136,7 +153,7 @@ def test_a_gap_that_looks_like_the_background_is_closed_where_it_moves() -> None
     grey = np.where(thing, 40.0, wall).astype(np.float32)
     grey[30:50, 124:136] = 100.0
     around = grown(thing, CONFIG.moving_reach)
-    assert outlined(thing, around, grey, wall, CONFIG)[32:48, 126:134].all()
+    assert outlined(thing, around, coloured(grey), coloured(wall), CONFIG)[32:48, 126:134].all()
     beside = thing.copy()
     beside[25:55, 119:141] = False
-    assert not outlined(beside, around, grey, wall, CONFIG)[34:46, 128:132].any()
+    assert not outlined(beside, around, coloured(grey), coloured(wall), CONFIG)[34:46, 128:132].any()

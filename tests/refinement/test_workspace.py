@@ -131,15 +131,19 @@ def test_images_of_an_array_are_kept_apart(tmp_path: Path) -> None:
     kept = workspace(tmp_path)
     kept.create("depth")
     kept.create("grey", np.uint8, full_size=True)
+    kept.create("colour", np.uint8, channels=(2,))
     image, grey = smooth((16, 24), 1.0)[..., 0], np.full((20, 36), 7, np.uint8)
     kept.write("depth", (0, 2), image)
     kept.write("grey", (1, 4), grey)
+    kept.write("colour", (1, 3), np.arange(360).reshape(10, 18, 2) % 256)
+    np.testing.assert_array_equal(kept.read("colour", (1, 3)).ravel(), np.arange(360) % 256)
     np.testing.assert_array_equal(kept.read("depth", (0, 2)), image)
     np.testing.assert_array_equal(kept.read("grey", (1, 4)), grey)
     for name, frame, shape in (
         ("depth", (0, 1), (16, 24)),
         ("depth", (1, 2), (10, 18)),
         ("grey", A, (32, 48)),
+        ("colour", (1, 4), (10, 18, 2)),
     ):
         other = kept.read(name, frame)
         assert other.shape == shape and (other == 0).all()
