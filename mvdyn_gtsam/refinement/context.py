@@ -29,6 +29,8 @@ not."""
 
 COLOUR = "colour differences"
 """The array of what ``colour_differences`` finds."""
+LABELS = "labels"
+"""The array of moving regions, numbered from 1 in every frame."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ makes that one over time; ``moving_depth_task`` writes it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from mvdyn_gtsam.frontend.dense_depth import filled
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
-from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
+from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
 from mvdyn_gtsam.refinement.edges import Edge
 from mvdyn_gtsam.refinement.free_space import BEHIND, TRUSTED, DepthView, sight, without_outlines
 from mvdyn_gtsam.refinement.initial import (
@@ -33,14 +32,12 @@ from mvdyn_gtsam.refinement.initial import (
 from mvdyn_gtsam.refinement.moving_depth import (
     InstantView,
     RegionDepth,
-    link,
     observed_region,
     region_depth,
     side_seen,
-    smooth_over_time,
-    standing_still,
 )
 from mvdyn_gtsam.refinement.outline import OtherTime, background, depth_behind, grown, outlined
+from mvdyn_gtsam.refinement.over_time import KnownDepth
 from mvdyn_gtsam.refinement.parts import depth_of_parts
 from mvdyn_gtsam.refinement.views import pixels_seen
 
@@ -70,18 +67,6 @@ SETTLED_SHARE = 0.25
 MARGIN = 9
 """Side of the square by which moving regions of other cameras grow before they deny a depth, px of the view.
 Source: choice, what their outlines err by."""
-LABELS = "labels"
-"""The array of moving regions, numbered from 1 in every frame."""
-
-
-@dataclass(frozen=True)
-class KnownDepth:
-    """Of a moving region of a frame."""
-
-    log_inverse_depth: float
-    moving: int
-    """``MOVING`` where the images of this instant or those near support that it moves there; ``STATIC`` where
-    another camera sees it stand still; else ``UNEXPLAINED``."""
 
 
 def free_space_task(context: Context, frame: Frame) -> None:
@@ -238,40 +223,6 @@ def _instant_views(context: Context, frame: Frame, margin: int) -> list[InstantV
         )
         for j in ((camera, frame[1]) for camera in context.group_of(frame[0]) if camera != frame[0])
     ]
-
-
-def depth_of_regions(
-    context: Context, frames: list[Frame], found: list[list[RegionDepth]]
-) -> list[dict[int, KnownDepth]]:
-    """Depth by label of the moving regions of each of ``frames``, as far as anything is known of it.
-
-    ``found`` is what ``observe_task`` returned for each.
-    """
-    regions_found = [region for each in found for region in each]
-    number = {(region.frame, region.label): k for k, region in enumerate(regions_found)}
-    links = []
-    with_regions = {region.frame for region in regions_found}
-    for camera, time in with_regions:
-        before = (camera, time - 1)
-        if before in with_regions:
-            labels = [
-                np.asarray(context.workspace.read(LABELS, f), np.int32) for f in (before, (camera, time))
-            ]
-            for a, b in link(labels[0], labels[1]):
-                links.append((number[before, a], number[(camera, time), b]))
-    result: dict[Frame, dict[int, KnownDepth]] = {frame: {} for frame in frames}
-    if regions_found:
-        still = standing_still(regions_found, links)
-        solved, belief = smooth_over_time(regions_found, sorted(links))
-        for region, stands, theta, believed in zip(regions_found, still, solved, belief, strict=True):
-            if stands:
-                result[region.frame][region.label] = KnownDepth(region.matched, STATIC)
-            elif believed > context.config.moving_evidence:
-                result[region.frame][region.label] = KnownDepth(float(theta), MOVING)
-            elif np.isfinite(region.matched):
-                # nobody can believe that it moves, and there it would stand still
-                result[region.frame][region.label] = KnownDepth(region.matched, UNEXPLAINED)
-    return [result[frame] for frame in frames]
 
 
 def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]) -> None:

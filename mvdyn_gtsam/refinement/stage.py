@@ -21,9 +21,10 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, to_grey
 from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_pairs
-from mvdyn_gtsam.refinement.context import COLOUR, Context, colour_differences
-from mvdyn_gtsam.refinement.motion import LABELS, depth_of_regions
+from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context, colour_differences
+from mvdyn_gtsam.refinement.growth import Growth
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
+from mvdyn_gtsam.refinement.over_time import depth_of_regions
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
 from mvdyn_gtsam.refinement.poses import solve_poses
 from mvdyn_gtsam.refinement.samples import FrameSample, SampleStore
@@ -231,7 +232,11 @@ class Refinement:
             assert isinstance(regions, list)
             found.append(regions)
             self._progress.update("refine: observe", done + 1, len(self._frames))
-        depths = depth_of_regions(self._context, self._frames, found)
+        grown: list[list[Growth]] = []
+        for growths in self._pool.map("growth", self._frames):
+            assert isinstance(growths, list)
+            grown.append(growths)
+        depths = depth_of_regions(self._context, self._frames, found, grown)
         self._map("moving depth", list(zip(self._frames, depths, strict=True)))
 
     def _sample(self) -> Callable[[], Iterable[FrameSample]]:

@@ -19,6 +19,7 @@ from mvdyn_gtsam.refinement.connections import Pair
 from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
 from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
 from mvdyn_gtsam.refinement.edges import Edge, load_edges
+from mvdyn_gtsam.refinement.growth import growth_task
 from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
     best_candidate,
@@ -323,6 +324,7 @@ TASKS = {
     "carry": carry_task,
     "settle": settle_task,
     "observe": observe_task,
+    "growth": growth_task,
     "moving depth": moving_depth_task,
     "window": window_task,
     "planes": planes_task,

@@ -1,4 +1,4 @@
-"""Depth of moving regions: what one instant says, and what the frames before and after make of it."""
+"""Depth of moving regions: what one instant says."""
 
 from __future__ import annotations
 
@@ -10,18 +10,14 @@ import pytest
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.refinement.moving_depth import (
-    FARTHEST,
     InstantView,
     RegionDepth,
     commonest,
     contradicted,
-    link,
     moving_there,
     observed_region,
     region_depth,
     side_seen,
-    smooth_over_time,
-    standing_still,
     support,
 )
 from mvdyn_gtsam.refinement.views import DenseView
@@ -176,90 +172,16 @@ def test_what_is_seen_from_the_side_is_nearer_than_its_middle() -> None:
 
 
 def test_what_is_seen_from_about_the_same_side_is_where_it_is_matched() -> None:
-    assert (way_to_the_front(10.0) == 0.0).all()
-    assert 0.0 < way_to_the_front(30.0).mean()
+    assert (way_to_the_front(25.0) == 0.0).all()
+    assert 0.0 < way_to_the_front(45.0).mean()
+
+
+def test_a_hull_that_no_view_ends_says_nothing() -> None:
+    """The other camera sees nothing but what moves, or not the front of it."""
+    assert (way_to_the_front(90.0, radius=5.0) == 0.0).all()
 
 
 def test_a_side_that_nobody_sees_moves_nothing() -> None:
     theta = np.full(1, np.log(0.5), np.float32)
     assert (side_seen(theta, RAYS[:1], []) == 0.0).all()
     assert (side_seen(theta, RAYS[:1], [beside(textured(), 400)]) == 0.0).all()
-
-
-def test_regions_that_overlap_are_one_thing() -> None:
-    before, now = np.zeros(SHAPE, np.int32), np.zeros(SHAPE, np.int32)
-    before[10:20, 10:20], before[40:50, 10:20] = 1, 2
-    now[10:20, 14:24], now[40:50, 19:40] = 2, 1
-    assert link(before, now) == [(1, 2)]
-    assert link(before, np.zeros(SHAPE, np.int32)) == []
-
-
-def walk(count: int, wrong: dict[int, float], evidence: dict[int, float]) -> list[RegionDepth]:
-    """A thing that walks away slowly, seen wrongly at some times."""
-    return [RegionDepth((0, t), 1, wrong.get(t, -0.01 * t), evidence.get(t, 1.0)) for t in range(count)]
-
-
-def chain(count: int) -> list[tuple[int, int]]:
-    return [(t, t + 1) for t in range(count - 1)]
-
-
-def test_a_wrong_instant_gives_way_to_those_around() -> None:
-    regions = walk(20, {9: -1.2}, {})
-    solved, belief = smooth_over_time(regions, chain(20))
-    np.testing.assert_allclose(solved, -0.01 * np.arange(20), atol=0.03)
-    assert (belief > 0.5).all()
-
-
-def test_frames_without_evidence_take_it_from_the_nearest_with() -> None:
-    unseen = {t: 0.0 for t in range(8)}
-    regions = walk(20, {t: 1.0 for t in range(8)}, unseen)
-    solved, belief = smooth_over_time(regions, chain(20))
-    # it walks evenly, also before anybody saw it
-    np.testing.assert_allclose(solved, -0.01 * np.arange(20), atol=0.02)
-    assert (np.diff(belief[:8]) > 0.0).all()
-
-
-def test_even_motion_ends_where_the_scene_does() -> None:
-    """Seen for ten frames only, it would be 9 times as far off after 100 more."""
-    seen = {t: float(t < 10) for t in range(110)}
-    regions = [RegionDepth((0, t), 1, -0.02 * t if t < 10 else 0.0, seen[t]) for t in range(110)]
-    solved, _ = smooth_over_time(regions, chain(110))
-    assert solved.min() >= -0.18 - FARTHEST - 0.05
-
-
-def test_regions_apart_do_not_touch_each_other() -> None:
-    regions = walk(3, {}, {}) + [RegionDepth((1, t), 1, 2.0, 0.0) for t in range(3)]
-    solved, belief = smooth_over_time(regions, [(0, 1), (1, 2), (3, 4), (4, 5)])
-    np.testing.assert_allclose(solved[3:], 2.0)
-    assert (belief[3:] == 0.0).all()
-    assert (belief[:3] > 0.5).all()
-
-
-def test_a_single_region_keeps_its_depth() -> None:
-    solved, belief = smooth_over_time([RegionDepth((0, 0), 1, -0.7, 0.5)], [])
-    np.testing.assert_allclose(solved, [-0.7])
-    np.testing.assert_allclose(belief, [0.5])
-
-
-def still_regions(still: list[bool], start: int = 0) -> list[RegionDepth]:
-    """One region in every frame."""
-    return [RegionDepth((0, start + time), 1, 0.0, 0.0, 0.0, value) for time, value in enumerate(still)]
-
-
-def test_a_thing_that_moves_before_and_after_does_not_stand_still_for_a_frame() -> None:
-    still = [False] * 10 + [True, False, True] + [False] * 10
-    assert not standing_still(still_regions(still), chain(23)).any()
-
-
-def test_what_mostly_stands_still_does_where_it_is_seen_to() -> None:
-    still = [True, True, False, True, True, False, True]
-    assert standing_still(still_regions(still), chain(7)).tolist() == still
-    # a thing that stops: both halves keep what is said of them
-    stops = [False] * 12 + [True] * 12
-    assert standing_still(still_regions(stops), chain(24)).tolist() == stops
-
-
-def test_other_things_have_no_say_in_whether_one_stands_still() -> None:
-    regions = still_regions([True]) + still_regions([False] * 4) + still_regions([True], 30)
-    assert standing_still(regions, [(1, 2), (2, 3), (3, 4)]).tolist() == [True] + [False] * 4 + [True]
-    assert standing_still(regions[:1], []).tolist() == [True]
