@@ -27,8 +27,8 @@ STATIC, MOVING, UNEXPLAINED = 0, 1, 2
 not."""
 
 
-COLOUR = "colour differences"
-"""The array of what ``colour_differences`` finds."""
+COLOUR = "colour"
+"""The array of what ``smooth_colour`` makes of the images."""
 LABELS = "labels"
 """The array of moving regions, numbered from 1 in every frame."""
 
@@ -70,33 +70,27 @@ class Context:
 
     def luminance(self, frame: Frame) -> Float32:
         """``(h, w)`` without the noise of single pixels."""
-        grey = np.asarray(self.workspace.read("grey", frame), np.uint8)
-        return np.asarray(_smooth(grey, self.workspace.views[frame[0]]), np.float32)
+        return np.asarray(self.workspace.read(COLOUR, frame)[..., 0], np.float32)
 
     def colour(self, frame: Frame) -> Float32:
         """``(h, w, 3)``: luminance and the two differences of colour, grey levels, likewise."""
-        differences = np.asarray(self.workspace.read(COLOUR, frame), np.float32)
-        return np.dstack([self.luminance(frame), differences])
+        return self.image(COLOUR, frame)
 
     def trust(self, frame: Frame) -> Float32:
         """``(h, w)`` in [0, 1], how far the flow settles the depth solved last."""
         return trust_of(self.image("information", frame))
 
 
-def colour_differences(image: Image, view: DenseView) -> Image:
-    """``(h, w, 2)``: by how much a grey or RGB image ``(H, W[, 3])`` is redder and bluer than grey, 128 where
-    it is not, without the noise of single pixels.
+def smooth_colour(image: Image, view: DenseView) -> Image:
+    """``(h, w, 3)`` of a grey or RGB image ``(H, W[, 3])``, without the noise of single pixels: luminance,
+    and by how much it is redder and bluer than grey, 128 where it is not.
 
-    Cr and Cb of JPEG (https://www.w3.org/Graphics/JPEG/jfif3.pdf): a change of either is as large as one of
-    luminance.
+    Y, Cr and Cb of JPEG (https://www.w3.org/Graphics/JPEG/jfif3.pdf).
     """
+    small = np.asarray(view.shrink(cv2.GaussianBlur(image, (0, 0), 1.0)), np.uint8)
     if image.ndim == 2:
-        return np.full((*view.shape, 2), 128, np.uint8)
-    return np.asarray(cv2.cvtColor(_smooth(image, view), cv2.COLOR_RGB2YCrCb)[..., 1:], np.uint8)
-
-
-def _smooth(image: Image, view: DenseView) -> Image:
-    return np.asarray(view.shrink(cv2.GaussianBlur(image, (0, 0), 1.0)), np.uint8)
+        return np.dstack([small, np.full((*small.shape, 2), 128, np.uint8)])
+    return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2YCrCb), np.uint8)
 
 
 def trust_of(information: Float32) -> Float32:

@@ -220,6 +220,7 @@ def _instant_views(context: Context, frame: Frame, margin: int) -> list[InstantV
             jTi=invert_pose(wTc[j]) @ wTc[frame],
             theta=context.image("prior", j),
             moves=cv2.dilate((np.asarray(workspace.read(LABELS, j)) > 0).astype(np.uint8), square) > 0,
+            instant=np.log(context.image("instant", j)),
         )
         for j in ((camera, frame[1]) for camera in context.group_of(frame[0]) if camera != frame[0])
     ]

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
-from mvdyn_gtsam.refinement.initial import closed
+from mvdyn_gtsam.refinement.initial import closed, known_median
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import pixels_seen
 
@@ -67,7 +67,7 @@ def depth_behind(around: Mask, rays: Float32, intrinsics: Array, others: Sequenc
         here = np.log(inverse_depth / ratio)
         order = np.argsort(here)  # the nearest is written last, and stays
         row[pixel[order]] = here[order]
-    return _median(seen).reshape(around.shape)
+    return known_median(seen).reshape(around.shape)
 
 
 def background(
@@ -84,7 +84,7 @@ def background(
         value = _sampled(other.colour, at, NOTHING)
         free = front & (value[:, 0] >= 0.0) & (_sampled(other.moves.astype(np.float32), at, 1.0) < 0.1)
         row[free] = value[free]
-    return _median(seen.reshape(len(others), -1)).reshape(-1, 3)
+    return known_median(seen)
 
 
 def grown(mask: Mask, reach: float) -> Mask:
@@ -108,14 +108,6 @@ def outlined(mask: Mask, around: Mask, colour: Float32, behind: Float32, config:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     moves = np.asarray(cv2.morphologyEx(moves, cv2.MORPH_CLOSE, kernel), np.uint8)
     return np.asarray(((moves > 0) | (closed(moves, config) > 0) & mask) & around)
-
-
-def _median(seen: Float32) -> Float32:
-    """``(M,)`` of ``seen (K, M)`` without its NaN, NaN where there is nothing else."""
-    result = np.full(seen.shape[1], np.nan, np.float32)
-    known = np.isfinite(seen).any(axis=0)
-    result[known] = np.nanmedian(seen[:, known], axis=0)
-    return result
 
 
 def _sampled(image: Float32, at: Float32, outside: float) -> Float32:

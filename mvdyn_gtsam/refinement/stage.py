@@ -21,7 +21,7 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, to_grey
 from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_pairs
-from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context, colour_differences
+from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context, smooth_colour
 from mvdyn_gtsam.refinement.growth import Growth
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
 from mvdyn_gtsam.refinement.over_time import depth_of_regions
@@ -40,8 +40,8 @@ Array = npt.NDArray[np.float64]
 
 BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
-BYTES_PER_PIXEL = 60.0
-"""Of a view on disk besides its flow: thirteen arrays of 32 bits and eight of 8."""
+BYTES_PER_PIXEL = 61.0
+"""Of a view on disk besides its flow: thirteen arrays of 32 bits and nine of 8."""
 FAILS, CARRIED = "fails", "carried"
 """The arrays of where the static model fails that ``carry`` reads and writes in turn."""
 CARRY_ROUNDS = 4
@@ -192,7 +192,7 @@ class Refinement:
     def _store_images(self) -> None:
         workspace, tracked = self._workspace, self._tracked
         workspace.create("grey", np.uint8, full_size=True)
-        workspace.create(COLOUR, np.uint8, channels=(2,))
+        workspace.create(COLOUR, np.uint8, channels=(3,))
         workspace.create("moving", np.uint8)
         for name in (FAILS, CARRIED, "stands", "held"):
             workspace.create(name, np.uint8)
@@ -206,7 +206,7 @@ class Refinement:
             view = workspace.views[frame[0]]
             image = tracked.read(*frame)
             workspace.write("grey", frame, to_grey(image))
-            workspace.write(COLOUR, frame, colour_differences(image, view))
+            workspace.write(COLOUR, frame, smooth_colour(image, view))
             depth, confidence = tracked.depth(*frame)
             inverse = np.asarray(view.shrink(1.0 / _without_holes(depth)), np.float32)
             trust = np.asarray(view.shrink(np.where(np.isfinite(depth), confidence, 0.0)), np.float32)

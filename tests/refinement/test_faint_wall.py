@@ -10,7 +10,7 @@ import pytest
 
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
-from mvdyn_gtsam.refinement.context import Context, trust_of
+from mvdyn_gtsam.refinement.context import COLOUR, Context, smooth_colour, trust_of
 from mvdyn_gtsam.refinement.motion import settle_task
 from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
 from mvdyn_gtsam.refinement.settings import RefinementConfig
@@ -37,6 +37,7 @@ def made(folder: Path, contrast: float) -> Context:
     workspace = Workspace(folder / "work", (view,), FRAMES)
     workspace.prepare("settings")
     workspace.create("grey", np.uint8, full_size=True)
+    workspace.create(COLOUR, np.uint8, channels=(3,))
     for name in ("held", "fails", "labels"):
         workspace.create(name, np.uint8)
     for name in ("tracked", "aligned", "swept", "first", "information", "prior", "prior_weight"):
@@ -47,7 +48,9 @@ def made(folder: Path, contrast: float) -> Context:
     for time in range(FRAMES):
         shift = round(PX_PER_FRAME * time)
         image = texture[:, shift : shift + WIDTH] + rng.standard_normal((HEIGHT, WIDTH))
-        workspace.write("grey", (0, time), np.clip(np.rint(image), 0, 255).astype(np.uint8))
+        grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        workspace.write("grey", (0, time), grey)
+        workspace.write(COLOUR, (0, time), smooth_colour(grey, view))
         for name in ("tracked", "aligned"):
             workspace.write(name, (0, time), np.full(view.shape, 1.0 / WRONG, np.float32))
     noise = np.exp(0.05 * rng.standard_normal(view.shape))

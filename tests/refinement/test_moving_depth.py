@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +15,7 @@ from mvdyn_gtsam.refinement.moving_depth import (
     InstantView,
     RegionDepth,
     commonest,
+    confirmed_there,
     contradicted,
     moving_there,
     observed_region,
@@ -61,7 +64,8 @@ def beside(grey: Float32, shift: int, moves: Mask = EVERYWHERE) -> InstantView:
     jTi = np.eye(4)
     jTi[0, 3] = -shift * 2.0 / 70.0
     wall = np.full(SHAPE, np.log(0.2), np.float32)
-    return InstantView(np.roll(grey, -shift, axis=1), INTRINSICS, jTi, wall, moves)
+    thing = np.full(SHAPE, np.log(0.5), np.float32)
+    return InstantView(np.roll(grey, -shift, axis=1), INTRINSICS, jTi, wall, moves, thing)
 
 
 def test_the_right_depth_is_supported_and_a_wrong_one_is_not() -> None:
@@ -125,13 +129,25 @@ def test_a_depth_that_is_denied_is_no_evidence() -> None:
     assert found.evidence == 0.0 and np.exp(found.matched) == pytest.approx(0.5, rel=0.02) and not found.still
 
 
+def test_a_depth_at_which_the_other_view_finds_something_else_is_no_evidence() -> None:
+    """The thing that moves there is 2 m away to both, or 4 m to the other."""
+    grey, instant = textured(), np.full(SHAPE, 0.5, np.float32)
+    view = beside(grey, 8)
+    theta, rays = np.full(int(REGION.sum()), np.log(0.5), np.float32), RAYS[REGION.ravel()]
+    farther = replace(view, instant=view.instant - np.float32(np.log(2.0)))
+    assert confirmed_there(theta, rays, [view]) == 1.0 and observed(instant, grey, view).evidence == 1.0
+    assert confirmed_there(theta, rays, [farther]) == 0.0 and observed(instant, grey, farther).evidence == 0.0
+    assert confirmed_there(theta, rays, [farther, view]) == 1.0
+    assert confirmed_there(theta, rays, []) == 0.0
+
+
 def test_what_another_view_sees_stand_still_there_does_not_move() -> None:
     """The wall 5 m away, which another camera sees 3 px to the left."""
     grey, instant = textured(), np.full(SHAPE, 0.2, np.float32)
     jTi = np.eye(4)
     jTi[0, 3] = -3.0 * 5.0 / 70.0
     wall = np.full(SHAPE, np.log(0.2), np.float32)
-    view = InstantView(np.roll(grey, -3, axis=1), INTRINSICS, jTi, wall, ~EVERYWHERE)
+    view = InstantView(np.roll(grey, -3, axis=1), INTRINSICS, jTi, wall, ~EVERYWHERE, wall)
     found = observed(instant, grey, view)
     assert found.still and found.evidence == 0.0
     assert found.log_inverse_depth == found.matched == pytest.approx(np.log(0.2), abs=0.02)
@@ -155,7 +171,7 @@ def from_the_side(degrees: float, radius: float) -> InstantView:
     jTi[:3, 3] = [0.0, 0.0, 2.0] - jTi[:3, :3] @ [0.0, 0.0, 2.0]
     moves = np.abs(np.arange(SHAPE[1]) - 39.5) <= 70.0 * radius / 2.0
     wall = np.full(SHAPE, np.log(0.2), np.float32)
-    return InstantView(textured(), INTRINSICS, jTi, wall, np.broadcast_to(moves, SHAPE))
+    return InstantView(textured(), INTRINSICS, jTi, wall, np.broadcast_to(moves, SHAPE), wall)
 
 
 def way_to_the_front(degrees: float, radius: float = 0.3) -> Float32:

@@ -29,7 +29,7 @@ def seen_from_aside(grey: Float32, nearer: np.ndarray, moves: np.ndarray = EVERY
     front = np.roll(nearer, -8, axis=1)
     image[front] = np.roll(grey, -8, axis=1)[front]
     wall = np.full(SHAPE, np.log(0.1), np.float32)
-    return InstantView(image, INTRINSICS, jTi, wall, moves)
+    return InstantView(image, INTRINSICS, jTi, wall, moves, wall)
 
 
 def shares(theta: Float32) -> tuple[float, float]:

@@ -16,7 +16,7 @@ import pytest
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import ConfigError, ResultError
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
-from mvdyn_gtsam.refinement.context import Context
+from mvdyn_gtsam.refinement.context import COLOUR, Context
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.tasks import windows
@@ -33,7 +33,7 @@ def context(folder: Path) -> Context:
     workspace.prepare("test")
     for name in ("before", "after", "prior", "prior_weight", "information"):
         workspace.create(name)
-    workspace.create("grey", np.uint8, full_size=True)
+    workspace.create(COLOUR, np.uint8, channels=(3,))
     workspace.create("moving", np.uint8)
     for time_ in range(6):
         workspace.write("before", (0, time_), np.full((12, 16), 1.0 + time_, np.float32))
