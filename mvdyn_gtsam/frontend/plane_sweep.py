@@ -2,8 +2,8 @@
 
 For every pixel and every inverse depth of a ladder, patches of other views are compared; semi-global
 aggregation (https://doi.org/10.1109/TPAMI.2007.1166) picks a depth that its neighbours can share. Views of
-the same instant see moving things frozen; views of other times see only what stands still. So a depth may be
-supported by all views together or by those of its instant alone, whichever says more.
+the same instant see moving things frozen; views of other times see only what stands still. So what stands
+still is swept against all views together, what moves against those of its instant alone.
 """
 
 from __future__ import annotations
@@ -105,17 +105,6 @@ class SweepView:
     same_instant: bool
 
 
-@dataclass(frozen=True)
-class SweptDepth:
-    """What a sweep found."""
-
-    inverse_depth: Float32
-    """``(h, w)``, finite and positive: supported by all views, as if nothing moved."""
-    instant: Float32
-    """``(h, w)``: supported by the views of the same instant alone; as ``inverse_depth`` without such
-    views."""
-
-
 def sweep(
     grey: npt.NDArray[np.uint8],
     intrinsics: Array,
@@ -124,27 +113,49 @@ def sweep(
     known: Float32,
     confidence: Float32,
     config: SweepConfig,
-) -> SweptDepth:
-    """Inverse depth of an image ``(h, w)`` against ``views`` over evenly spaced inverse depths ``(D,)``.
+) -> Float32:
+    """Inverse depth ``(h, w)`` of an image ``(h, w)`` that all ``views`` support, as if nothing moved.
 
-    ``known`` and ``confidence``, both ``(h, w)``, are an inverse depth believed so far and how far. Raises
-    ValueError for a ladder that is not ascending and positive.
+    Of the evenly spaced ``ladder (D,)``, finite and positive. ``known`` and ``confidence``, both ``(h, w)``,
+    are an inverse depth believed so far and how far. Raises ValueError for a ladder that is not ascending and
+    positive.
     """
+    weights = [1.0 if view.same_instant else config.temporal_weight for view in views]
+    score = _score(grey, intrinsics, views, weights, ladder, config)
+    score += _prior_score(ladder, known.ravel(), confidence.ravel(), config)
+    return _settled(score, grey, ladder, config)
+
+
+def sweep_instant(
+    grey: npt.NDArray[np.uint8],
+    intrinsics: Array,
+    views: Sequence[SweepView],
+    ladder: Float32,
+    config: SweepConfig,
+) -> Float32:
+    """Inverse depth ``(h, w)`` that the ``views`` of an image's instant support alone, of what moves too; as
+    ``sweep``."""
+    # alone they must carry what all views together carry there
+    weights = [config.instant_weight] * len(views)
+    return _settled(_score(grey, intrinsics, views, weights, ladder, config), grey, ladder, config)
+
+
+def _score(
+    grey: npt.NDArray[np.uint8],
+    intrinsics: Array,
+    views: Sequence[SweepView],
+    weights: Sequence[float],
+    ladder: Float32,
+    config: SweepConfig,
+) -> Float32:
+    """What the views say for each level, ``(D, h * w)``."""
     if len(ladder) < 3 or not (ladder[0] > 0.0 and (np.diff(ladder) > 0.0).all()):
         raise ValueError("the inverse depths to sweep must be positive and ascending, three at least")
-    instant, score = (np.zeros((len(ladder), grey.size), np.float32) for _ in range(2))
-    for view in views:
+    score = np.zeros((len(ladder), grey.size), np.float32)
+    for view, weight in zip(views, weights, strict=True):
         likeness = patch_likeness(grey, intrinsics, view, ladder, config).reshape(len(ladder), -1)
-        cv2.scaleAdd(likeness, 1.0 if view.same_instant else config.temporal_weight, score, dst=score)
-        if view.same_instant:
-            instant += likeness
-    score += _prior_score(ladder, known.ravel(), confidence.ravel(), config)
-    static = _settled(score, grey, ladder, config)
-    if not any(view.same_instant for view in views):
-        return SweptDepth(static, static)
-    # alone they must carry what all views together carry above
-    instant *= np.float32(config.instant_weight)
-    return SweptDepth(static, _settled(instant, grey, ladder, config))
+        cv2.scaleAdd(likeness, weight, score, dst=score)
+    return score
 
 
 def _prior_score(ladder: Float32, known: Float32, confidence: Float32, config: SweepConfig) -> Float32:

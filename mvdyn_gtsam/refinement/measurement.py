@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, FlowPair
 from mvdyn_gtsam.frontend.guided_flow import guided_weight, predicted_flow
-from mvdyn_gtsam.frontend.plane_sweep import SweepConfig, SweepView, SweptDepth, ladder_of, sweep
+from mvdyn_gtsam.frontend.plane_sweep import SweepConfig, SweepView, ladder_of, sweep, sweep_instant
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.neighbours import times_in_view
@@ -19,53 +19,83 @@ from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+MARGIN = 8
+"""Pixels of the swept size around what moves that are swept with it: its outline in other cameras is that
+unsure. Source: choice."""
 
 
 def sweep_frame(
     workspace: Workspace, frame: Frame, group: Sequence[int], wTc: Array, config: SweepConfig
-) -> SweptDepth:
-    """A frame at the view's size, swept against its instant and other times.
+) -> Float32:
+    """Inverse depth of a frame at the view's size, swept against its instant and other times.
 
     ``wTc (N, T, 4, 4)``. Reads ``grey``, ``tracked`` and ``tracked_confidence`` of the workspace.
     """
-    camera, time = frame
-    views = [DenseView.of(view.camera, config.scale) for view in workspace.views]
-    own = views[camera]
-    sources = [(other, time) for other in group if other != camera]
-    sources += [
-        (camera, t)
-        for t in times_in_view(workspace, frame, wTc, config.temporal_offsets, config.least_shared)
-    ]
-    others = [
-        SweepView(
-            grey=np.asarray(views[j[0]].shrink(workspace.read("grey", j)), np.uint8),
-            intrinsics=views[j[0]].intrinsics,
-            jTi=invert_pose(wTc[j]) @ wTc[frame],
-            same_instant=j[1] == time,
-        )
-        for j in sources
-    ]
-    tracked = np.asarray(workspace.read("tracked", frame), np.float32)
-    known = np.concatenate([tracked[::4, ::4].ravel(), *(_samples(workspace, j) for j in sources)])
+    own = DenseView.of(workspace.views[frame[0]].camera, config.scale)
+    sources = _sources(workspace, frame, group, wTc, config)
     found = sweep(
         np.asarray(own.shrink(workspace.read("grey", frame)), np.uint8),
         own.intrinsics,
-        others,
-        ladder_of(known, config.levels),
-        np.asarray(own.shrink(tracked), np.float32),
+        [_sweep_view(workspace, frame, j, wTc, config) for j in sources],
+        _ladder(workspace, [frame, *sources], config),
+        np.asarray(own.shrink(workspace.read("tracked", frame)), np.float32),
         np.asarray(own.shrink(workspace.read("tracked_confidence", frame)), np.float32),
         config,
     )
-    size = workspace.views[camera].shape[::-1]
-    grown = [
-        np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.float32)
-        for image in (found.inverse_depth, found.instant)
-    ]
-    return SweptDepth(*grown)
+    size = workspace.views[frame[0]].shape[::-1]
+    return np.asarray(cv2.resize(found, size, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _samples(workspace: Workspace, frame: Frame) -> Float32:
-    return np.asarray(workspace.read("tracked", frame), np.float32)[::4, ::4].ravel()
+def sweep_moving(
+    workspace: Workspace, frame: Frame, group: Sequence[int], wTc: Array, moves: Mask, config: SweepConfig
+) -> Float32:
+    """Inverse depth of a frame at the view's size: where it ``moves (h, w)``, and around, swept against the
+    other views of its instant, elsewhere ``swept``.
+
+    Reads ``grey``, ``tracked`` and ``swept`` of the workspace.
+    """
+    view = workspace.views[frame[0]]
+    own = DenseView.of(view.camera, config.scale)
+    sources = _sources(workspace, frame, group, wTc, config)
+    views = [_sweep_view(workspace, frame, j, wTc, config) for j in sources if j[1] == frame[1]]
+    there = np.asarray(cv2.resize(moves.astype(np.float32), own.shape[::-1], interpolation=cv2.INTER_AREA))
+    rows, columns = (
+        slice(max(0, int(at.min()) - MARGIN), int(at.max()) + MARGIN + 1) for at in np.nonzero(there)
+    )
+    intrinsics = own.intrinsics.copy()
+    intrinsics[:2, 2] -= columns.start, rows.start
+    grey = np.asarray(own.shrink(workspace.read("grey", frame)), np.uint8)[rows, columns]
+    ladder = _ladder(workspace, [frame, *sources], config)
+    found = np.array(own.shrink(workspace.read("swept", frame)), np.float32)
+    found[rows, columns] = sweep_instant(np.ascontiguousarray(grey), intrinsics, views, ladder, config)
+    return np.asarray(cv2.resize(found, view.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def _sources(
+    workspace: Workspace, frame: Frame, group: Sequence[int], wTc: Array, config: SweepConfig
+) -> list[Frame]:
+    """What a frame is swept against: the other cameras of its instant, and its camera at other times."""
+    camera, time = frame
+    times = times_in_view(workspace, frame, wTc, config.temporal_offsets, config.least_shared)
+    return [(other, time) for other in group if other != camera] + [(camera, t) for t in times]
+
+
+def _sweep_view(workspace: Workspace, frame: Frame, j: Frame, wTc: Array, config: SweepConfig) -> SweepView:
+    view = DenseView.of(workspace.views[j[0]].camera, config.scale)
+    return SweepView(
+        grey=np.asarray(view.shrink(workspace.read("grey", j)), np.uint8),
+        intrinsics=view.intrinsics,
+        jTi=invert_pose(wTc[j]) @ wTc[frame],
+        same_instant=j[1] == frame[1],
+    )
+
+
+def _ladder(workspace: Workspace, frames: Sequence[Frame], config: SweepConfig) -> Float32:
+    """Inverse depths to try, by what tracking knows of ``frames``."""
+    known = [np.asarray(workspace.read("tracked", j), np.float32)[::4, ::4].ravel() for j in frames]
+    return ladder_of(np.concatenate(known), config.levels)
 
 
 def measure_pair(

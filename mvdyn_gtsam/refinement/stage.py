@@ -227,6 +227,7 @@ class Refinement:
     def _settle(self) -> None:
         """What moves, and the depth that phase 2 begins with."""
         self._map("settle", self._frames)
+        self._map("instant", self._frames)
         found: list[list[RegionDepth]] = []
         for done, regions in enumerate(self._pool.map("observe", self._frames)):
             assert isinstance(regions, list)

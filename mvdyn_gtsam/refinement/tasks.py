@@ -16,7 +16,7 @@ import numpy.typing as npt
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import Pair
-from mvdyn_gtsam.refinement.context import MOVING, STATIC, UNEXPLAINED, Context
+from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
 from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
 from mvdyn_gtsam.refinement.edges import Edge, load_edges
 from mvdyn_gtsam.refinement.growth import growth_task
@@ -27,7 +27,7 @@ from mvdyn_gtsam.refinement.initial import (
     most_telling,
     static_residual,
 )
-from mvdyn_gtsam.refinement.measurement import measure_pair, sweep_frame
+from mvdyn_gtsam.refinement.measurement import measure_pair, sweep_frame, sweep_moving
 from mvdyn_gtsam.refinement.motion import (
     carry_task,
     free_space_task,
@@ -59,11 +59,19 @@ PLANES = "planes"
 
 
 def sweep_task(context: Context, frame: Frame) -> None:
-    """Depth of a frame by plane sweep, static and of its instant."""
+    """Depth of a frame by plane sweep, as if nothing moved."""
     group = context.group_of(frame[0])
     swept = sweep_frame(context.workspace, frame, group, context.poses(), context.config.sweep)
-    context.workspace.write("swept", frame, swept.inverse_depth)
-    context.workspace.write("instant", frame, swept.instant)
+    context.workspace.write("swept", frame, swept)
+
+
+def instant_task(context: Context, frame: Frame) -> None:
+    """Depth of what moves in a frame by plane sweep against the other cameras of its instant."""
+    group, moves = context.group_of(frame[0]), np.asarray(context.workspace.read(LABELS, frame)) > 0
+    swept = context.image("swept", frame)
+    if moves.any() and len(group) > 1:
+        swept = sweep_moving(context.workspace, frame, group, context.poses(), moves, context.config.sweep)
+    context.workspace.write("instant", frame, swept)
 
 
 def temporal_flow_task(context: Context, pair: Pair) -> None:
@@ -323,6 +331,7 @@ TASKS = {
     "free space": free_space_task,
     "carry": carry_task,
     "settle": settle_task,
+    "instant": instant_task,
     "observe": observe_task,
     "growth": growth_task,
     "moving depth": moving_depth_task,

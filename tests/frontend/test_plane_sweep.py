@@ -16,18 +16,19 @@ from mvdyn_gtsam.frontend.dense_flow import pixel_raster
 from mvdyn_gtsam.frontend.plane_sweep import (
     SweepConfig,
     SweepView,
-    SweptDepth,
     compared_levels,
     ladder_of,
     lowest,
     patch_likeness,
     semi_global,
     sweep,
+    sweep_instant,
 )
 from mvdyn_gtsam.geometry import invert_pose, pixel_rays, project, transform_points
 from tests.frontend.textures import to_image, values
 
 Array = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
 
 SHAPE = (72, 96)
 INTRINSICS = np.array([[80.0, 0.0, 47.5], [0.0, 80.0, 35.5], [0.0, 0.0, 1.0]])
@@ -64,8 +65,12 @@ def seen(wTc: Array, same_instant: bool = True, moved: float = 0.0) -> SweepView
     return SweepView(render(wTc, moved)[0], INTRINSICS, invert_pose(wTc), same_instant)
 
 
-def swept(views: list[SweepView], config: SweepConfig = CONFIG) -> SweptDepth:
+def swept(views: list[SweepView], config: SweepConfig = CONFIG) -> Float32:
     return sweep(render(pose(0.0))[0], INTRINSICS, views, LADDER, *NOTHING_KNOWN, config)
+
+
+def swept_alone(views: list[SweepView]) -> Float32:
+    return sweep_instant(render(pose(0.0))[0], INTRINSICS, views, LADDER, CONFIG)
 
 
 def inner(mask: npt.NDArray[np.bool_], margin: int = 3) -> npt.NDArray[np.bool_]:
@@ -93,27 +98,38 @@ def wrong_share(inverse_depth: npt.NDArray[np.floating], where: npt.NDArray[np.b
 
 
 def test_the_depth_of_a_still_scene_is_found_to_a_level() -> None:
-    found = swept([seen(wTc, same_instant=k < 2) for k, wTc in enumerate(AROUND)])
-    assert wrong_share(found.inverse_depth, INTERIOR) < 0.01
-    assert wrong_share(found.instant, INTERIOR) < 0.03
+    views = [seen(wTc, same_instant=k < 2) for k, wTc in enumerate(AROUND)]
+    found = swept(views)
+    assert wrong_share(found, INTERIOR) < 0.01
+    assert wrong_share(swept_alone(views[:2]), INTERIOR) < 0.03
     # between the levels, not at them
-    assert np.median(np.abs(found.inverse_depth - TRUTH)[INTERIOR]) < 0.15 * STEP
+    assert np.median(np.abs(found - TRUTH)[INTERIOR]) < 0.15 * STEP
 
 
 def test_what_moves_gets_its_depth_from_the_views_of_its_instant() -> None:
     """The board moves 0.4 of the way the camera does: to it alone the board is 1 / 0.3 away."""
     temporal = [seen(pose(x), same_instant=False, moved=0.4 * x) for x in (-0.3, -0.15, 0.15, 0.3)]
-    found = swept([*temporal, seen(pose(0.05, 0.3)), seen(pose(0.1, -0.3))])
+    instant = [seen(pose(0.05, 0.3)), seen(pose(0.1, -0.3))]
+    found = swept([*temporal, *instant])
     on_board = inner(BOARD)
-    assert wrong_share(found.instant, on_board) < 0.02
-    assert np.median(found.inverse_depth[on_board]) == pytest.approx(0.3, abs=STEP)
-    assert wrong_share(found.inverse_depth, inner(~BOARD)) < 0.05
+    assert wrong_share(swept_alone(instant), on_board) < 0.02
+    assert np.median(found[on_board]) == pytest.approx(0.3, abs=STEP)
+    assert wrong_share(found, inner(~BOARD)) < 0.05
 
 
-def test_without_views_of_the_instant_there_is_one_answer() -> None:
-    found = swept([seen(wTc, same_instant=False) for wTc in AROUND])
-    np.testing.assert_array_equal(found.instant, found.inverse_depth)
-    assert wrong_share(found.inverse_depth, INTERIOR) < 0.01
+def test_views_of_other_times_alone_tell_a_still_scene() -> None:
+    assert wrong_share(swept([seen(wTc, same_instant=False) for wTc in AROUND]), INTERIOR) < 0.01
+
+
+def test_a_part_of_an_image_is_swept_like_the_whole() -> None:
+    rows, columns = slice(10, 60), slice(20, 80)
+    intrinsics = INTRINSICS.copy()
+    intrinsics[:2, 2] -= 20, 10
+    grey = np.ascontiguousarray(render(pose(0.0))[0][rows, columns])
+    views = [seen(wTc) for wTc in AROUND[:2]]
+    part = sweep_instant(grey, intrinsics, views, LADDER, CONFIG)
+    whole = swept_alone(views)[rows, columns]
+    assert (np.abs(part - whole)[4:-4, 4:-4] < 0.2 * STEP).mean() > 0.95
 
 
 def test_a_view_that_sees_nothing_changes_nothing() -> None:
@@ -123,7 +139,7 @@ def test_a_view_that_sees_nothing_changes_nothing() -> None:
     np.testing.assert_array_equal(likeness, np.float32(CONFIG.unseen))
     views = [seen(wTc) for wTc in AROUND[:2]]
     before, after = swept(views), swept([*views, away])
-    np.testing.assert_allclose(after.inverse_depth, before.inverse_depth, atol=0.05 * STEP)
+    np.testing.assert_allclose(after, before, atol=0.05 * STEP)
 
 
 def test_what_would_be_behind_a_view_is_unseen_by_it() -> None:
@@ -139,7 +155,7 @@ def test_a_view_that_sees_a_part_does_not_hurt_the_rest() -> None:
     views = [seen(wTc) for wTc in AROUND[:2]]
     aside = seen(pose(0.4, turn_deg=40.0))
     before, after = swept(views), swept([*views, aside])
-    assert wrong_share(after.inverse_depth, INTERIOR) < wrong_share(before.inverse_depth, INTERIOR) + 0.02
+    assert wrong_share(after, INTERIOR) < wrong_share(before, INTERIOR) + 0.02
 
 
 def test_likeness_is_highest_at_the_truth_and_bounded() -> None:
@@ -156,7 +172,7 @@ def test_the_known_depth_decides_where_the_image_is_plain() -> None:
     view = SweepView(plain, INTRINSICS, invert_pose(pose(0.02)), True)
     found = sweep(plain, INTRINSICS, [view], LADDER, known, np.ones(SHAPE, np.float32), CONFIG)
     inside = np.s_[5:-5, 5:-5]
-    np.testing.assert_allclose(found.inverse_depth[inside], 0.4, atol=STEP)
+    np.testing.assert_allclose(found[inside], 0.4, atol=STEP)
 
 
 def test_the_known_depth_without_confidence_says_nothing() -> None:
@@ -166,7 +182,7 @@ def test_the_known_depth_without_confidence_says_nothing() -> None:
         sweep(grey, INTRINSICS, views, LADDER, np.full(SHAPE, rho, np.float32), nothing, CONFIG)
         for rho in (0.15, 0.6)
     ]
-    np.testing.assert_array_equal(found[0].inverse_depth, found[1].inverse_depth)
+    np.testing.assert_array_equal(found[0], found[1])
 
 
 @pytest.mark.parametrize(
