@@ -9,6 +9,7 @@ makes that one over time; ``moving_depth_task`` writes it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
 from mvdyn_gtsam.refinement.edges import Edge
 from mvdyn_gtsam.refinement.free_space import BEHIND, TRUSTED, DepthView, sight, without_outlines
+from mvdyn_gtsam.refinement.ground import footing
 from mvdyn_gtsam.refinement.initial import (
     carried_regions,
     closed,
@@ -52,10 +54,6 @@ LEAK_REACH = 0.2
 it does no more. Source: 0.1 to 0.3 compared on four rendered scenes."""
 OWN_SHARE = 0.4
 """Of its own depth that a pixel keeps there, whatever the flow says. Source: 0.3 to 1 compared there."""
-FEET = 0.1
-"""Lowest share of a thing's height at which it touches the ground."""
-GROUND_ROWS = 2
-"""Rows of the view below it that are the ground."""
 FREE_SPACE_RASTER = 2
 """Pixels of the view between those asked whether others see through them. Source: time; things are
 larger."""
@@ -194,18 +192,19 @@ def settle_task(context: Context, frame: Frame) -> None:
 
 
 def observe_task(context: Context, frame: Frame) -> list[RegionDepth]:
-    """What the other cameras of the instant say of each moving region of a frame."""
+    """What the other cameras of the instant say of each moving region of a frame, and where it stands."""
     workspace = context.workspace
     labels = np.asarray(workspace.read(LABELS, frame))
-    views = _instant_views(context, frame, MARGIN)
-    if not views or not labels.any():
+    if not labels.any():
         return []
+    views, rays = _instant_views(context, frame, MARGIN), workspace.views[frame[0]].rays
     grey, instant = context.luminance(frame), context.image("instant", frame)
-    rays = workspace.views[frame[0]].rays
-    return [
-        observed_region(frame, label, instant, labels == label, grey, rays, views)
-        for label in range(1, int(labels.max()) + 1)
-    ]
+    theta, found = context.image("prior", frame), []
+    for label in range(1, int(labels.max()) + 1):
+        region = labels == label
+        seen = observed_region(frame, label, instant, region, grey, rays, views)
+        found.append(replace(seen, footing=footing(theta, region, labels == 0)))
+    return found
 
 
 def _instant_views(context: Context, frame: Frame, margin: int) -> list[InstantView]:
@@ -229,7 +228,7 @@ def _instant_views(context: Context, frame: Frame, margin: int) -> list[InstantV
 def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]) -> None:
     """Where phase 2 begins: what stands still as settled, moving regions at the depth given.
 
-    Regions without one are put on the ground; these and those not believed stay unexplained.
+    Regions without one stay where their background is; these and those not believed stay unexplained.
     """
     frame, depths = job
     workspace, config = context.workspace, context.config
@@ -240,14 +239,15 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]
     # what other frames' tasks change of these views meanwhile lies where something moves, and is not read
     views, wide_views = (_instant_views(context, frame, margin) if depths else [] for margin in (1, MARGIN))
     grey = context.luminance(frame)
-    for label in range(1, int(labels.max()) + 1):
+    for label, known in depths.items():
         region = labels == label
-        if label not in depths:
-            theta[region] = standing(theta, region, labels == 0)
+        moving[region] = known.moving
+        if known.flat:
+            # nothing stands behind its background
+            theta[region] = np.maximum(theta[region], np.float32(known.log_inverse_depth))
             continue
-        matched = np.log(region_depth(instant, region, depths[label].log_inverse_depth))
-        moving[region] = depths[label].moving
-        if depths[label].moving == MOVING:
+        matched = np.log(region_depth(instant, region, known.log_inverse_depth))
+        if known.moving == MOVING:
             matched = depth_of_parts(matched, region, grey, rays, wide_views)
             matched = matched + side_seen(matched, rays[region.ravel()], views)
         # nothing lies behind its background, which is known only about
@@ -257,37 +257,6 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]
     workspace.write("prior_weight", frame, weight)
     workspace.write("moving", frame, moving)
     workspace.write("begun", frame, np.exp(theta))
-
-
-def standing(theta: Float32, region: Mask, still: Mask) -> Float32:
-    """Log inverse depth of the pixels of ``region (h, w)`` if it stands on what is below it in the image.
-
-    ``theta (h, w)`` is that of the background. Where the lower end is not in the image, what is ``still
-    (h, w)`` beside it at the border stands for the ground, which it hides there. For things that no other
-    camera sees: most stand on the ground, and most cameras are held upright.
-    """
-    rows, columns = np.nonzero(region)
-    lowest = int(rows.max())
-    if lowest + GROUND_ROWS < len(theta):
-        height = lowest - int(rows.min()) + 1
-        feet = np.unique(columns[rows > lowest - max(1, round(FEET * height))])
-        ground = np.median(theta[lowest + 1 : lowest + 1 + GROUND_ROWS, feet])
-    else:
-        beside = _beside(columns[rows >= len(theta) - GROUND_ROWS], np.all(still[-GROUND_ROWS:], axis=0))
-        if not len(beside):
-            return theta[region]
-        ground = np.median(theta[-GROUND_ROWS:, beside])
-    # nothing stands behind its background
-    return np.maximum(theta[region], ground).astype(np.float32)
-
-
-def _beside(columns: npt.NDArray[np.int64], usable: Mask) -> npt.NDArray[np.int64]:
-    """Of the columns ``usable (w,)`` the nearest to those from the least to the greatest of ``columns``, as
-    many as there are in between."""
-    first, last = int(columns.min()), int(columns.max())
-    there = np.flatnonzero(usable)
-    distance = np.maximum(first - there, there - last)
-    return there[np.argsort(distance, kind="stable")[: last - first + 1]]
 
 
 def kept_far_off(moves: Mask) -> Float32:

@@ -12,6 +12,7 @@ from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.free_space import AGREES, depth_beyond
+from mvdyn_gtsam.refinement.ground import Footing
 from mvdyn_gtsam.refinement.patches import likeness
 
 Array = npt.NDArray[np.float64]
@@ -66,6 +67,8 @@ class RegionDepth:
     """Commonest where the images match, whatever the views deny; NaN where they do not match."""
     still: bool = False
     """Whether another view sees something that stands still just there."""
+    footing: Footing | None = None
+    """Where it stands, if that can be told."""
 
 
 @dataclass(frozen=True)

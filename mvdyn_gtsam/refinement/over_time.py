@@ -9,7 +9,7 @@ before and after, each counting as far as the images of its instant support it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +43,9 @@ FADING_STEPS = 24.0
 """Frames after which another frame's evidence counts 1/e."""
 LEAST_WEIGHT = 1e-5
 """Of an observation without evidence: a region that nothing else tells of keeps it. Source: choice."""
+FEET_OUTSIDE = 0.02
+"""Evidence of the ground at the border for a thing that reaches out of the image; of that below feet it is 1.
+Source: choice."""
 ITERATIONS = 10
 STILL_STEPS = 5
 """Frames before and after that have a say in whether a thing stands still. Source: choice; frames that differ
@@ -57,6 +60,8 @@ class KnownDepth:
     moving: int
     """``MOVING`` where the images of this instant or those near support that it moves there; ``STATIC`` where
     another camera sees it stand still; else ``UNEXPLAINED``."""
+    flat: bool = False
+    """Whether all of it lies there, whatever the views of the instant say of its pixels."""
 
 
 def depth_of_regions(
@@ -88,7 +93,10 @@ def depth_of_regions(
             if one.first in number and one.second in number
         ]
         solved, belief = smooth_over_time(regions_found, sorted(links), growths)
-        for region, stands, theta, believed in zip(regions_found, still, solved, belief, strict=True):
+        ground = on_the_ground(regions_found, sorted(links), growths)
+        for region, stands, theta, believed, below in zip(
+            regions_found, still, solved, belief, ground, strict=True
+        ):
             if stands:
                 result[region.frame][region.label] = KnownDepth(region.matched, STATIC)
             elif believed > context.config.moving_evidence:
@@ -96,6 +104,8 @@ def depth_of_regions(
             elif np.isfinite(region.matched):
                 # nobody can believe that it moves, and there it would stand still
                 result[region.frame][region.label] = KnownDepth(region.matched, UNEXPLAINED)
+            elif np.isfinite(below):
+                result[region.frame][region.label] = KnownDepth(float(below), UNEXPLAINED, flat=True)
     return [result[frame] for frame in frames]
 
 
@@ -168,6 +178,32 @@ def smooth_over_time(
             # motion that goes on evenly would leave the scene
             solved[unmeasured] = np.clip(solved[unmeasured], seen.min() - FARTHEST, seen.max() + FARTHEST)
     return solved, belief
+
+
+def on_the_ground(
+    regions: Sequence[RegionDepth],
+    links: Sequence[tuple[int, int]],
+    growths: Sequence[tuple[int, int, float, float]],
+) -> Array:
+    """Log inverse depth ``(N,)`` of ``regions`` by where they stand, at this time or others; NaN where that
+    is never seen. Arguments as in ``smooth_over_time``."""
+    standing = [
+        replace(region, evidence=0.0)
+        if region.footing is None
+        else replace(
+            region,
+            log_inverse_depth=region.footing.log_inverse_depth,
+            evidence=1.0 if region.footing.feet_seen else FEET_OUTSIDE,
+        )
+        for region in regions
+    ]
+    solved, belief = smooth_over_time(standing, links, growths)
+    # whose feet are outside stands there or nearer
+    least = [
+        -np.inf if region.footing is None or region.footing.feet_seen else region.footing.log_inverse_depth
+        for region in regions
+    ]
+    return np.where(belief > 0.0, np.maximum(solved, least), np.nan)
 
 
 def _evenness(links: Sequence[tuple[int, int]], count: int) -> sparse.csr_array:

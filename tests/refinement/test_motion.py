@@ -9,7 +9,7 @@ import numpy as np
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
 from mvdyn_gtsam.refinement.context import Context
-from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, carry_task, kept_far_off, standing
+from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, carry_task, kept_far_off
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
@@ -27,44 +27,6 @@ def test_depth_is_kept_far_from_what_moves_only() -> None:
 
 def test_without_motion_every_pixel_keeps_its_share() -> None:
     np.testing.assert_allclose(kept_far_off(np.zeros((4, 5), bool)), OWN_SHARE)
-
-
-def floor_and_wall() -> np.ndarray:
-    """Log inverse depth of a floor that comes nearer downwards from row 20, and a wall above."""
-    rows = np.arange(48, dtype=np.float32)[:, None] + np.zeros((1, 64), np.float32)
-    return np.log(0.2 + 0.02 * np.maximum(rows - 20.0, 0.0)).astype(np.float32)
-
-
-def test_a_thing_stands_where_its_feet_are() -> None:
-    theta, region = floor_and_wall(), np.zeros((48, 64), bool)
-    region[10:36, 30:34] = True
-    found = standing(theta, region, ~region)
-    np.testing.assert_allclose(found, theta[36:38, 0].mean(), atol=0.03)
-
-
-def test_a_thing_whose_feet_are_outside_hides_the_ground_at_the_border() -> None:
-    """Behind it the floor is unknown, and a box stands by that must not count."""
-    theta, region = floor_and_wall(), np.zeros((48, 64), bool)
-    region[10:48, 30:34] = True
-    ground = theta[46:48, 0].mean()
-    theta[region] = theta[0, 0]
-    box = np.zeros_like(region)
-    box[30:48, 34:40] = True
-    theta[box] += 1.0
-    found = standing(theta, region, ~(region | box))
-    np.testing.assert_allclose(found, ground, atol=0.03)
-
-
-def test_a_thing_that_fills_the_border_keeps_its_background() -> None:
-    theta, region = floor_and_wall(), np.zeros((48, 64), bool)
-    region[10:48] = True
-    np.testing.assert_array_equal(standing(theta, region, ~region), theta[region])
-
-
-def test_nothing_stands_behind_its_background() -> None:
-    theta, region = floor_and_wall()[::-1].copy(), np.zeros((48, 64), bool)
-    region[4:30, 30:34] = True
-    assert (standing(theta, region, ~region) >= theta[region]).all()
 
 
 def test_what_is_too_fast_for_flow_is_carried_from_the_next_frames(tmp_path: Path) -> None:
