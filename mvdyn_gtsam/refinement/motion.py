@@ -159,26 +159,11 @@ def _near(context: Context, edges: Sequence[Edge]) -> list[Edge]:
 def settle_task(context: Context, frame: Frame) -> None:
     """What moves in a frame, by the vote of the frames around it, and the depth of what stands still."""
     workspace, config = context.workspace, context.config
-    edges = context.edges(frame, context.poses(), own_camera=True)
-    theta = context.image("first", frame)
-    near = _near(context, edges)
-    votes = [np.asarray(workspace.read("fails", edge.j)) for edge in near]
-    labels = moving_regions(np.asarray(workspace.read("fails", frame)), near, votes, config)
-    # flow that a static depth explains is the best evidence against motion
-    residual = static_residual(np.exp(theta), edges)
-    explained = (residual < config.moving_px) & (np.asarray(workspace.read("fails", frame)) == 0)
-    around = grown(labels > 0, config.moving_reach) & ~explained | (labels > 0)
-    # between things that move, their regions close over what stands there
-    still = proven_still(residual, edges, config)
-    around &= ~still
-    labels[still] = 0
+    labels, around = _what_moves(context, frame)
     trust = context.trust(frame)
     trust[around] = 0.0
-    # depth of what moves must not leak into the plain wall behind it, and what is plain mostly stands behind:
-    # an average of depth cubed leans to the far side
     if trust.max() > LEAST_TRUST:
-        cubed = filled(np.exp(-3.0 * theta).astype(np.float32), np.maximum(trust, kept_far_off(around)))
-        theta = np.asarray(-np.log(cubed) / 3.0, np.float32)
+        theta = _without_leaks(context.image("first", frame), trust, around)
         if (labels > 0).any():
             labels, theta = _outlined(context, frame, labels > 0, around, theta)
     else:
@@ -189,6 +174,32 @@ def settle_task(context: Context, frame: Frame) -> None:
     workspace.write("prior", frame, theta)
     workspace.write("prior_weight", frame, np.where(held, np.maximum(weight, config.held_sigma**-2), weight))
     workspace.write(LABELS, frame, labels.astype(np.uint8))
+
+
+def _what_moves(context: Context, frame: Frame) -> tuple[Labels, Mask]:
+    """Label ``(h, w)`` of the regions that move, and where their outlines are to be looked for."""
+    config, edges = context.config, context.edges(frame, context.poses(), own_camera=True)
+    own, near = np.asarray(context.workspace.read("fails", frame)), _near(context, edges)
+    votes = [np.asarray(context.workspace.read("fails", edge.j)) for edge in near]
+    labels = moving_regions(own, near, votes, config)
+    # flow that a static depth explains is the best evidence against motion
+    residual = static_residual(np.exp(context.image("first", frame)), edges)
+    explained = (residual < config.moving_px) & (own == 0)
+    around = grown(labels > 0, config.moving_reach) & ~explained | (labels > 0)
+    # between things that move, their regions close over what stands there
+    still = proven_still(residual, edges, config)
+    labels[still] = 0
+    return labels, around & ~still
+
+
+def _without_leaks(theta: Float32, trust: Float32, around: Mask) -> Float32:
+    """Log inverse depth ``theta (h, w)`` filled in from where there is ``trust (h, w)``.
+
+    Depth of what moves, ``around (h, w)``, must not leak into the plain wall behind it, and what is plain
+    mostly stands behind: an average of depth cubed leans to the far side.
+    """
+    cubed = filled(np.exp(-3.0 * theta).astype(np.float32), np.maximum(trust, kept_far_off(around)))
+    return np.asarray(-np.log(cubed) / 3.0, np.float32)
 
 
 def observe_task(context: Context, frame: Frame) -> list[RegionDepth]:
