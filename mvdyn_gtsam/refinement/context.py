@@ -11,6 +11,7 @@ import numpy.typing as npt
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.edges import Edge, load_edges
+from mvdyn_gtsam.refinement.initial import FlowTargets
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
@@ -29,6 +30,8 @@ not."""
 
 COLOUR = "colour"
 """The array of what ``smooth_colour`` makes of the images."""
+TARGETS = "flow targets"
+"""The table of ``FlowTargets``."""
 LABELS = "labels"
 """The array of moving regions, numbered from 1 in every frame."""
 
@@ -60,6 +63,15 @@ class Context:
         """Measured edges of a frame, at pixels ``among`` or all; ``own_camera``: only within its camera."""
         wanted = [j for j in self.neighbours.get(frame, ()) if not own_camera or j[0] == frame[0]]
         return load_edges(self.workspace, frame, wanted, wTc, among)
+
+    def keep_flow_targets(self, frame: Frame, targets: FlowTargets) -> None:
+        """For ``flow_targets``."""
+        self.workspace.write_table(TARGETS, frame, np.column_stack([targets.times, targets.pixels]))
+
+    def flow_targets(self, frame: Frame) -> FlowTargets:
+        """As kept."""
+        table = np.asarray(self.workspace.read_table(TARGETS, frame), np.int32)
+        return FlowTargets(table[:, 0], table[:, 1:])
 
     def raster(self, frame: Frame, spacing: float) -> npt.NDArray[np.int64]:
         """Flat indices, ascending, of a frame's pixels ``spacing`` px of the input apart."""

@@ -4,6 +4,7 @@ best, and for what moves a depth from the views of its instant."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -104,42 +105,63 @@ def failing_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[
     return result
 
 
+@dataclass(frozen=True)
+class FlowTargets:
+    """Where sure flow finds the ``N`` pixels of a frame at ``K`` other times of its camera."""
+
+    times: npt.NDArray[np.int32]
+    """``(K,)``"""
+    pixels: npt.NDArray[np.int32]
+    """``(K, N)`` flat indices; -1 where flow is not sure, or leads outside."""
+
+
+def flow_targets(edges: Sequence[Edge], pixels: int) -> FlowTargets:
+    """Of a frame of so many ``pixels`` and its ``edges`` within the camera."""
+    table = np.full((len(edges), pixels), -1, np.int32)
+    for row, edge in zip(table, edges, strict=True):
+        sure = edge.weight >= SURE_WEIGHT
+        row[edge.pixels[sure]] = edge.nearest[sure]
+    return FlowTargets(np.array([edge.j[1] for edge in edges], dtype=np.int32), table)
+
+
 def moving_regions(
     own: npt.NDArray[np.uint8],
-    edges: Sequence[Edge],
+    targets: FlowTargets,
     there: Sequence[npt.NDArray[np.uint8]],
     config: RefinementConfig,
 ) -> npt.NDArray[np.int32]:
     """Label ``(h, w)`` of the regions that move, 0 elsewhere.
 
-    ``own (h, w)`` says where the static model fails in this frame, ``there`` where it does in the frames
-    that the ``edges`` lead to. The pixels and those that the flow finds there vote: what moves evenly along
-    its epipolar lines for a moment passes for static in one frame, and noise for motion, but not in most.
+    ``own (h, w)`` says where the static model fails in this frame, ``there`` where it does at the times of
+    the ``targets``. The pixels and those that the flow finds there vote: what moves evenly along its epipolar
+    lines for a moment passes for static in one frame, and noise for motion, but not in most.
     """
-    votes, count = _votes(own.size, edges, there)
+    votes, count = _votes(targets.pixels, there)
     moves = votes + own.ravel() >= config.moving_share * (count + 1.0)
     return _whole_regions(moves.reshape(own.shape), config)
 
 
 def carried_regions(
     own: npt.NDArray[np.uint8],
-    edges: Sequence[Edge],
+    time: int,
+    targets: FlowTargets,
     there: Sequence[npt.NDArray[np.uint8]],
     beside: Mask,
     stands: npt.NDArray[np.uint8],
     config: RefinementConfig,
 ) -> npt.NDArray[np.uint8]:
-    """Where the static model fails in a frame ``(h, w)``, with what moves in those before or after.
+    """Where the static model fails in the frame of a ``time`` ``(h, w)``, with what moves in those before or
+    after.
 
     As in ``moving_regions``; here nearly all of one side must agree, so that what is found is carried to the
     ends of a video, over pauses, and through moments of even motion; but not where others see a surface that
-    ``stands (h, w)`` there. Where no edge has flow, what moves too fast for it, ``beside (h, w)`` decides:
+    ``stands (h, w)`` there. Where flow leads nowhere, what moves too fast for it, ``beside (h, w)`` decides:
     whether it moves there in the frames next to this one.
     """
     carried, found_flow = np.zeros(own.size, bool), np.zeros(own.size, bool)
-    for past in (True, False):
-        side = [k for k, edge in enumerate(edges) if (edge.j[1] < edge.i[1]) == past]
-        votes, count = _votes(own.size, [edges[k] for k in side], [there[k] for k in side])
+    for side in (targets.times < time, targets.times > time):
+        others = [fails for fails, on_side in zip(there, side, strict=True) if on_side]
+        votes, count = _votes(targets.pixels[side], others)
         carried |= (count > 0.0) & (votes >= config.carried_share * count)
         found_flow |= count > 0.0
     carried |= ~found_flow & beside.ravel()
@@ -147,16 +169,14 @@ def carried_regions(
     return np.maximum(own, (found > 0).astype(np.uint8))
 
 
-def _votes(
-    pixels: int, edges: Sequence[Edge], there: Sequence[npt.NDArray[np.uint8]]
-) -> tuple[Float32, Float32]:
-    """How many of the frames that ``edges`` lead to call each pixel failing, and how many see it."""
-    votes, count = (np.zeros(pixels, np.float32) for _ in range(2))
-    for edge, fails in zip(edges, there, strict=True):
-        seen = (edge.nearest >= 0) & (edge.weight >= SURE_WEIGHT)
-        votes[edge.pixels[seen]] += fails.ravel()[edge.nearest[seen]]
-        count[edge.pixels[seen]] += 1.0
-    return votes, count
+def _votes(targets: npt.NDArray[np.int32], there: Sequence[npt.NDArray[np.uint8]]) -> tuple[Float32, Float32]:
+    """How many of the frames ``there`` call each pixel failing, and how many see it, ``(N,)`` each; they see
+    it at ``targets (K, N)``."""
+    votes = np.zeros(targets.shape[1], np.float32)
+    for pixels, fails in zip(targets, there, strict=True):
+        # the last index stands for none, and is masked
+        votes += np.take(fails.ravel(), pixels) * (pixels >= 0)
+    return votes, (targets >= 0).sum(axis=0).astype(np.float32)
 
 
 def _whole_regions(mask: Mask, config: RefinementConfig) -> npt.NDArray[np.int32]:

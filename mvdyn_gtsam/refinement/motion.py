@@ -8,7 +8,6 @@ makes that one over time; ``moving_depth_task`` writes it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -20,7 +19,6 @@ from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
-from mvdyn_gtsam.refinement.edges import Edge
 from mvdyn_gtsam.refinement.free_space import BEHIND, TRUSTED, DepthView, sight, without_outlines
 from mvdyn_gtsam.refinement.ground import footing
 from mvdyn_gtsam.refinement.initial import (
@@ -121,11 +119,12 @@ def carry_task(context: Context, job: tuple[str, str, Frame]) -> None:
     """Carry what moves before and after into a frame: ``(read from, write to, frame)``, arrays."""
     source, target, frame = job
     workspace = context.workspace
-    edges = _near(context, context.edges(frame, context.poses(), own_camera=True))
-    there = [np.asarray(workspace.read(source, edge.j)) for edge in edges]
+    targets = context.flow_targets(frame)
+    there = [np.asarray(workspace.read(source, (frame[0], int(time)))) for time in targets.times]
     own, stands = (np.asarray(workspace.read(name, frame)) for name in (source, "stands"))
     beside = _seen_beside(context, source, frame) & (context.trust(frame) < TRUSTED)
-    workspace.write(target, frame, carried_regions(own, edges, there, beside, stands, context.config))
+    found = carried_regions(own, frame[1], targets, there, beside, stands, context.config)
+    workspace.write(target, frame, found)
 
 
 def _seen_beside(context: Context, name: str, frame: Frame) -> Mask:
@@ -148,12 +147,6 @@ def _seen_beside(context: Context, name: str, frame: Frame) -> Mask:
         )
         found &= (there > 0) & front.reshape(view.shape)
     return found
-
-
-def _near(context: Context, edges: Sequence[Edge]) -> list[Edge]:
-    """Of the edges within a camera those that flow was measured for densely."""
-    reach = max(context.config.temporal_offsets, default=0)
-    return [edge for edge in edges if abs(edge.j[1] - edge.i[1]) <= reach]
 
 
 def settle_task(context: Context, frame: Frame) -> None:
@@ -179,9 +172,9 @@ def settle_task(context: Context, frame: Frame) -> None:
 def _what_moves(context: Context, frame: Frame) -> tuple[Labels, Mask]:
     """Label ``(h, w)`` of the regions that move, and where their outlines are to be looked for."""
     config, edges = context.config, context.edges(frame, context.poses(), own_camera=True)
-    own, near = np.asarray(context.workspace.read("fails", frame)), _near(context, edges)
-    votes = [np.asarray(context.workspace.read("fails", edge.j)) for edge in near]
-    labels = moving_regions(own, near, votes, config)
+    targets, own = context.flow_targets(frame), np.asarray(context.workspace.read("fails", frame))
+    there = [np.asarray(context.workspace.read("fails", (frame[0], int(time)))) for time in targets.times]
+    labels = moving_regions(own, targets, there, config)
     # flow that a static depth explains is the best evidence against motion
     residual = static_residual(np.exp(context.image("first", frame)), edges)
     explained = (residual < config.moving_px) & (own == 0)

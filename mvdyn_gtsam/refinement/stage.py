@@ -40,8 +40,11 @@ Array = npt.NDArray[np.float64]
 
 BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
-BYTES_PER_PIXEL = 61.0
-"""Of a view on disk besides its flow: thirteen arrays of 32 bits and nine of 8."""
+BYTES_PER_PIXEL = 93.0
+"""Of a view on disk besides its flow: thirteen arrays of 32 bits, nine of 8, and where flow leads at about
+eight other times."""
+WORKSPACE_FORMAT = 2
+"""Raised when what lies on disk changes: a refinement that an earlier version began is begun anew."""
 FAILS, CARRIED = "fails", "carried"
 """The arrays of where the static model fails that ``carry`` reads and writes in turn."""
 CARRY_ROUNDS = 4
@@ -140,7 +143,8 @@ class Refinement:
         """Everything but handing out the frames; what an earlier run finished is not done again."""
         config = self._config
         # the number of processes decides nothing
-        self._workspace.prepare(repr((replace(config, workers=0), self._context.flow_config)))
+        settings = (WORKSPACE_FORMAT, replace(config, workers=0), self._context.flow_config)
+        self._workspace.prepare(repr(settings))
         self._step("images", self._store_images)
         self._step("sweep", lambda: self._map("sweep", self._frames))
         self._step("temporal flow", lambda: self._map("temporal flow", self._within))

@@ -24,6 +24,7 @@ from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
     best_candidate,
     failing_regions,
+    flow_targets,
     most_telling,
     static_residual,
 )
@@ -96,7 +97,8 @@ def _measure(context: Context, pair: Pair, guide: str) -> None:
 
 
 def begin_task(context: Context, frame: Frame) -> None:
-    """First depth of a frame as if nothing moved, and where that fails."""
+    """First depth of a frame as if nothing moved, where that fails, and where flow leads in the frames
+    around."""
     workspace, config = context.workspace, context.config
     edges = context.edges(frame, context.poses(), own_camera=True)
     weights = _image_weights(context, frame)
@@ -107,6 +109,9 @@ def begin_task(context: Context, frame: Frame) -> None:
         np.log(chosen), FrameProblem(edges, {}, weights, weak, config), FIRST_STEPS
     )
     fails = failing_regions(static_residual(np.exp(theta), edges), config)
+    reach = max(config.temporal_offsets, default=0)
+    near = [edge for edge in edges if abs(edge.j[1] - frame[1]) <= reach]
+    context.keep_flow_targets(frame, flow_targets(near, theta.size))
     first = FirstDepth(theta, information, fails, np.zeros_like(fails))
     first = told_by_other_times(context, frame, first)
     workspace.write("first", frame, first.theta)

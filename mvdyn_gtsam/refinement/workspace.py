@@ -126,6 +126,17 @@ class Workspace:
             file.seek(layout.start(frame[1]))
             file.write(np.broadcast_to(image, layout.shape).astype(layout.dtype).tobytes())
 
+    def write_table(self, name: str, frame: Frame, table: npt.NDArray[np.generic]) -> None:
+        """Keep an array of a frame that has no fixed size."""
+        path = self._table_path(name, frame)
+        with _writing(path):
+            path.parent.mkdir(exist_ok=True)
+            np.save(path, table)
+
+    def read_table(self, name: str, frame: Frame) -> npt.NDArray[np.generic]:
+        """What ``write_table`` kept."""
+        return np.asarray(np.load(self._table_path(name, frame)))
+
     def write_array(self, name: str, array: npt.NDArray[np.float64]) -> None:
         """Keep one array of its own, such as the poses; the old one stays until the new one is whole."""
         temporary, path = self.folder / f".{name}.part.npy", self.folder / f"{name}.npy"
@@ -145,6 +156,9 @@ class Workspace:
                 shape, _, dtype = np.lib.format.read_array_header_1_0(file)
                 self._layouts[path] = _Layout(file.tell(), shape[1:], dtype)
         return self._layouts[path]
+
+    def _table_path(self, name: str, frame: Frame) -> Path:
+        return self.folder / name / f"{frame[0]}_{frame[1]:06d}.npy"
 
     def _path(self, name: str, camera: int) -> Path:
         return self.folder / f"{name}_{camera}.npy"

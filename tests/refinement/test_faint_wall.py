@@ -11,6 +11,7 @@ import pytest
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
 from mvdyn_gtsam.refinement.context import COLOUR, Context, smooth_colour, trust_of
+from mvdyn_gtsam.refinement.initial import flow_targets
 from mvdyn_gtsam.refinement.motion import settle_task
 from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
 from mvdyn_gtsam.refinement.settings import RefinementConfig
@@ -58,7 +59,9 @@ def made(folder: Path, contrast: float) -> Context:
     wTc = np.tile(np.eye(4), (1, FRAMES, 1, 1))
     wTc[0, :, 0, 3] = PX_PER_FRAME * WALL / FOCAL * np.arange(FRAMES)
     workspace.write_array("poses", wTc)
-    return Context(workspace, ((0,),), {}, CONFIG, DisFlow(), FlowConfig())
+    context = Context(workspace, ((0,),), {}, CONFIG, DisFlow(), FlowConfig())
+    context.keep_flow_targets(FRAME, flow_targets([], view.shape[0] * view.shape[1]))
+    return context
 
 
 def first_depth(context: Context, depth: float = WRONG) -> FirstDepth:

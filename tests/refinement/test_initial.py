@@ -14,10 +14,12 @@ from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_we
 from mvdyn_gtsam.refinement.edges import Edge
 from mvdyn_gtsam.refinement.initial import (
     SURE_WEIGHT,
+    FlowTargets,
     _triangulated,
     best_candidate,
     carried_regions,
     failing_regions,
+    flow_targets,
     most_telling,
     moving_regions,
     proven_still,
@@ -39,6 +41,7 @@ from tests.refinement.scenes import Scene, two_cameras
 CONFIG = RefinementConfig()
 FRAME: Frame = (0, 2)
 VIEW = small_view(2)
+TIME = FRAME[1]
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +70,10 @@ def square(row: int, col: int, size: int) -> Mask:
     mask = np.zeros(VIEW.shape, bool)
     mask[row : row + size, col : col + size] = True
     return mask
+
+
+def targets(edges: list[Edge]) -> FlowTargets:
+    return flow_targets(edges, VIEW.shape[0] * VIEW.shape[1])
 
 
 def middle() -> tuple[slice, slice]:
@@ -194,10 +201,20 @@ def test_what_the_frames_around_agree_on_moves(own_edges: list[Edge]) -> None:
         for edge in own_edges
     ]
     votes = [there.astype(np.uint8)] * len(edges)
-    labels = moving_regions(seen.astype(np.uint8), edges, votes, CONFIG)
+    labels = moving_regions(seen.astype(np.uint8), targets(edges), votes, CONFIG)
     assert (labels[seen] == 0).all()
     assert (labels[missed] > 0).mean() > 0.9 and len(np.unique(labels[missed & (labels > 0)])) == 1
     assert (labels[~missed] > 0).mean() < 0.01
+
+
+def test_flow_targets_are_where_sure_flow_leads(own_edges: list[Edge]) -> None:
+    edge = own_edges[0]
+    half = replace(edge, weight=np.where(edge.pixels % 2 == 0, edge.weight, 0.9 * SURE_WEIGHT))
+    found = targets([edge, half])
+    assert found.times.tolist() == [edge.j[1]] * 2
+    sure = edge.weight >= SURE_WEIGHT
+    np.testing.assert_array_equal(found.pixels[0, edge.pixels[sure]], edge.nearest[sure])
+    assert (found.pixels[1, 1::2] == -1).all() and (found.pixels[1, ::2] >= 0).any()
 
 
 def test_flow_of_little_weight_carries_no_vote(own_edges: list[Edge]) -> None:
@@ -205,23 +222,23 @@ def test_flow_of_little_weight_carries_no_vote(own_edges: list[Edge]) -> None:
     unsure = [replace(edge, weight=edge.weight * np.float32(0.9 * SURE_WEIGHT)) for edge in own_edges]
     nothing = [np.zeros(VIEW.shape, np.uint8)] * len(own_edges)
     own = seen.astype(np.uint8)
-    assert (moving_regions(own, own_edges, nothing, CONFIG) == 0).all()
+    assert (moving_regions(own, targets(own_edges), nothing, CONFIG) == 0).all()
     for edges in (unsure, []):
-        labels = moving_regions(own, edges, nothing[: len(edges)], CONFIG)
+        labels = moving_regions(own, targets(edges), nothing[: len(edges)], CONFIG)
         assert (labels[seen] > 0).mean() > 0.9
 
 
 def test_what_flows_out_of_the_image_has_no_vote(own_edges: list[Edge]) -> None:
     gone = [replace(edge, nearest=np.full_like(edge.nearest, -1)) for edge in own_edges]
     votes = [np.ones(VIEW.shape, np.uint8)] * len(gone)
-    assert (moving_regions(np.zeros(VIEW.shape, np.uint8), gone, votes, CONFIG) == 0).all()
+    assert (moving_regions(np.zeros(VIEW.shape, np.uint8), targets(gone), votes, CONFIG) == 0).all()
 
 
 def carried(edges: list[Edge], block: Mask, seen_by: Callable[[Edge], bool], stands: Mask) -> Mask:
     """Where the static model fails in a frame that saw nothing itself, of a block that some others saw."""
     there = [(block & seen_by(edge)).astype(np.uint8) for edge in edges]
     own, nowhere = np.zeros(VIEW.shape, np.uint8), np.zeros(VIEW.shape, bool)
-    return carried_regions(own, edges, there, nowhere, stands.astype(np.uint8), CONFIG) > 0
+    return carried_regions(own, TIME, targets(edges), there, nowhere, stands.astype(np.uint8), CONFIG) > 0
 
 
 def test_what_all_frames_of_one_side_see_move_is_carried(own_edges: list[Edge]) -> None:
@@ -254,18 +271,20 @@ def test_what_others_see_stand_there_is_not_carried(own_edges: list[Edge]) -> No
 def test_what_a_frame_sees_itself_stays(own_edges: list[Edge]) -> None:
     own, nothing = square(20, 30, 16).astype(np.uint8), np.zeros(VIEW.shape, np.uint8)
     nowhere, there = nothing > 0, [nothing] * len(own_edges)
-    assert (carried_regions(own, own_edges, there, nowhere, nothing, CONFIG) == own).all()
+    assert (carried_regions(own, TIME, targets(own_edges), there, nowhere, nothing, CONFIG) == own).all()
 
 
 def test_what_is_too_fast_for_flow_moves_where_the_next_frames_see_it(own_edges: list[Edge]) -> None:
     block, nothing = square(20, 30, 16), np.zeros(VIEW.shape, np.uint8)
     there = [nothing] * len(own_edges)
     lost = [replace(edge, weight=edge.weight * ~block.ravel()[edge.pixels]) for edge in own_edges]
-    found = carried_regions(nothing, lost, there, block, nothing, CONFIG) > 0
+    found = carried_regions(nothing, TIME, targets(lost), there, block, nothing, CONFIG) > 0
     assert found[block].mean() > 0.9 and found[~block].mean() < 0.02
     # flow that finds it standing still has the say, and so have others who see it stand
-    assert not carried_regions(nothing, own_edges, there, block, nothing, CONFIG).any()
-    assert not carried_regions(nothing, lost, there, block, block.astype(np.uint8), CONFIG).any()
+    assert not carried_regions(nothing, TIME, targets(own_edges), there, block, nothing, CONFIG).any()
+    assert not carried_regions(
+        nothing, TIME, targets(lost), there, block, block.astype(np.uint8), CONFIG
+    ).any()
 
 
 def test_what_two_frames_find_where_it_would_be_is_still(own_edges: list[Edge]) -> None:
@@ -281,7 +300,7 @@ def test_what_two_frames_find_where_it_would_be_is_still(own_edges: list[Edge]) 
 
 def test_two_blocks_are_two_regions_and_a_speck_is_none() -> None:
     own = (square(10, 10, 12) | square(35, 55, 12) | square(5, 60, 4)).astype(np.uint8)
-    labels = moving_regions(own, [], [], CONFIG)
+    labels = moving_regions(own, targets([]), [], CONFIG)
     assert {labels[16, 16], labels[41, 61]} == {1, 2} == set(np.unique(labels)) - {0}
     assert (labels[:9, 56:] == 0).all()
 

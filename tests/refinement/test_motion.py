@@ -9,6 +9,7 @@ import numpy as np
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
 from mvdyn_gtsam.refinement.context import Context
+from mvdyn_gtsam.refinement.initial import flow_targets
 from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, carry_task, kept_far_off
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView
@@ -44,6 +45,8 @@ def test_what_is_too_fast_for_flow_is_carried_from_the_next_frames(tmp_path: Pat
         workspace.write("fails", (0, time), block)
     workspace.write_array("poses", np.tile(np.eye(4), (1, 5, 1, 1)))
     context = Context(workspace, ((0,),), {}, RefinementConfig(stride=1), DisFlow(), FlowConfig())
+    for time in range(5):
+        context.keep_flow_targets((0, time), flow_targets([], block.size))
 
     def carried(time: int) -> np.ndarray:
         carry_task(context, ("fails", "carried", (0, time)))

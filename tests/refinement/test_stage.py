@@ -13,7 +13,7 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, FlowPair
 from mvdyn_gtsam.progress import NullProgress
 from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.stage import Refinement, Tracked
+from mvdyn_gtsam.refinement.stage import WORKSPACE_FORMAT, Refinement, Tracked
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
@@ -112,7 +112,18 @@ def test_another_number_of_processes_goes_on_with_the_same_work(tmp_path: Path) 
     refinement(tmp_path / "work", EvenFlow()).run()
     workspace = Workspace(tmp_path / "work", (DenseView.of(CAMERA, 1.0 / CONFIG.stride),), 4)
     before = workspace.finished()
-    workspace.prepare(repr((replace(CONFIG, workers=0), FlowConfig())))
+    workspace.prepare(repr((WORKSPACE_FORMAT, replace(CONFIG, workers=0), FlowConfig())))
     assert workspace.finished() == before
-    workspace.prepare(repr((replace(CONFIG, workers=0, rounds=3), FlowConfig())))
+    workspace.prepare(repr((WORKSPACE_FORMAT, replace(CONFIG, workers=0, rounds=3), FlowConfig())))
     assert workspace.finished() == []
+
+
+def test_what_an_earlier_version_began_is_begun_anew(tmp_path: Path) -> None:
+    """Its files are others; with the same settings it would be continued with what is not there."""
+    earlier = Workspace(tmp_path / "work", (DenseView.of(CAMERA, 1.0 / CONFIG.stride),), 4)
+    earlier.prepare(repr((WORKSPACE_FORMAT - 1, replace(CONFIG, workers=0), FlowConfig())))
+    for step in ("images", "sweep", "temporal flow"):
+        earlier.finish(step)
+    flow = EvenFlow()
+    refinement(tmp_path / "work", flow).run()
+    assert flow.measured > 0
