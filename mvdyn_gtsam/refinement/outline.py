@@ -25,6 +25,9 @@ Mask = npt.NDArray[np.bool_]
 
 NOTHING = -1000.0
 """Colour outside an image."""
+BLUR = 0.6
+"""Standard deviation of the blur against noise, px of the view. Source: 0.6 and 1 compared on four rendered
+scenes: the wider made a ring of what stands still move, up to 6 % of the error there."""
 ROW = 1024
 """Pixels are sampled in rows of so many: cv2.remap takes none of 2^15 and more."""
 
@@ -101,8 +104,8 @@ def outlined(mask: Mask, around: Mask, colour: Float32, behind: Float32, config:
     """
     known = np.isfinite(behind[..., 0]) & around
     difference = np.where(known, np.linalg.norm(colour - behind, axis=2), 0.0).astype(np.float32)
-    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.0)
-    difference = cv2.GaussianBlur(difference, (0, 0), 1.0) / np.maximum(weight, 1e-3)
+    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), BLUR)
+    difference = cv2.GaussianBlur(difference, (0, 0), BLUR) / np.maximum(weight, 1e-3)
     moves = np.where(known, difference > config.moving_contrast, mask & around).astype(np.uint8)
     moves = cv2.medianBlur(moves, 5)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
