@@ -1,9 +1,9 @@
 """What moves in a frame, and where phase 2 begins with it.
 
-Six steps, since a frame asks others: ``free_space_task`` adds what other views see through to where the
+Seven steps, since a frame asks others: ``free_space_task`` adds what other views see through to where the
 static model fails; ``carry_task`` what moves before and after; ``settle_task`` finds what moves and its
-outline; ``observe_task`` asks the cameras of the instant for the depth of each region; ``smooth_over_time``
-makes that one over time; ``moving_depth_task`` writes it.
+outline; ``observe_task`` asks the cameras of the instant for the depth of each region, ``growth_task`` the
+frames after for how it grows; ``depth_of_regions`` makes that one over time; ``moving_depth_task`` writes it.
 """
 
 from __future__ import annotations

@@ -171,13 +171,27 @@ def smooth_over_time(
     belief, measured = np.zeros(count), grown.diagonal() > 0.0
     for number in np.unique(group):
         same = np.flatnonzero(group == number)
-        fading = np.exp(-np.abs(times[same] - times[same, None]) / FADING_STEPS)
-        belief[same] = (weight[same] * fading).max(axis=1)
+        belief[same] = strongest_around(weight[same], times[same])
         seen, unmeasured = solved[same[weight[same] > SEEN]], same[~measured[same]]
         if len(seen):
             # motion that goes on evenly would leave the scene
             solved[unmeasured] = np.clip(solved[unmeasured], seen.min() - FARTHEST, seen.max() + FARTHEST)
     return solved, belief
+
+
+def strongest_around(evidence: Array, times: Array) -> Array:
+    """``(N,)``: the greatest of all ``evidence (N,)``, each faded by how far its time is from that of the
+    entry; ``times (N,)`` in frames."""
+    order = np.argsort(times)
+    steps = times[order] / FADING_STEPS
+    with np.errstate(divide="ignore"):
+        strength = np.log(evidence[order])
+    # what fades evenly is a maximum that runs along
+    before = np.maximum.accumulate(strength + steps) - steps
+    after = np.maximum.accumulate((strength - steps)[::-1])[::-1] + steps
+    result = np.empty_like(evidence)
+    result[order] = np.exp(np.maximum(before, after))
+    return result
 
 
 def on_the_ground(

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
-from mvdyn_gtsam.refinement.over_time import FARTHEST, link, smooth_over_time, standing_still
+from mvdyn_gtsam.refinement.over_time import (
+    FADING_STEPS,
+    FARTHEST,
+    link,
+    smooth_over_time,
+    standing_still,
+    strongest_around,
+)
 
 SHAPE = (60, 80)
 
@@ -41,6 +48,15 @@ def test_frames_without_evidence_take_it_from_the_nearest_with() -> None:
     # it walks evenly, also before anybody saw it
     np.testing.assert_allclose(solved, -0.01 * np.arange(20), atol=0.02)
     assert (np.diff(belief[:8]) > 0.0).all()
+
+
+def test_evidence_fades_with_the_frames_in_between() -> None:
+    rng = np.random.default_rng(2)
+    times = rng.integers(0, 200, 60).astype(np.float64)
+    evidence = np.where(rng.random(60) < 0.5, rng.random(60), 0.0)
+    plain = (evidence * np.exp(-np.abs(times - times[:, None]) / FADING_STEPS)).max(axis=1)
+    np.testing.assert_allclose(strongest_around(evidence, times), plain)
+    assert (strongest_around(np.zeros(5), np.arange(5.0)) == 0.0).all()
 
 
 def test_even_motion_ends_where_the_scene_does() -> None:
