@@ -25,8 +25,10 @@ LEAST_PIXELS = 50
 """That a measurement is made of. Source: choice."""
 MOST_PIXELS = 2000
 """That are used; more take time and say the same. Source: choice."""
-LEAST_SHARE = 0.2
-"""Of a region that the other frame must see of it. Source: as ``over_time.LEAST_OVERLAP``."""
+ONE_THING = 0.5
+"""Share of each of two regions that the other has of it from which they are one thing: of others the depths
+are not of the same. Source: 0.5 and 0.7 compared on two crowded random captures: what moves was 4 and 23 %
+better with 0.5 than when parts of a region counted, 5 and 16 % with 0.7."""
 ITERATIONS = 6
 NOISE_PX = 0.5
 """Least scale of the robust fit. Source: choice, noise of flow."""
@@ -118,13 +120,15 @@ def growths_along(
         counts = np.bincount(there[own == label])
         counts[0] = 0
         other = int(counts.argmax())
-        if counts[other] < max(LEAST_PIXELS, LEAST_SHARE * np.count_nonzero(labels == label)):
+        if counts[other] < max(LEAST_PIXELS, ONE_THING * np.count_nonzero(labels == label)):
             continue
         shared = sure[(own == label) & (there == other)]
         independent = len(shared) * (config.stride / CORRELATED_PX) ** 2
         measured = vertical_growth(
             edge.rays[shared, :2] * focal, edge.target[shared], edge.weight[shared], independent
         )
-        if measured is not None:
+        # what is shared there, in the pixels there
+        covered = len(shared) * np.exp(2.0 * measured[0]) if measured is not None else 0.0
+        if measured is not None and covered >= ONE_THING * np.count_nonzero(labels_there == other):
             found.append(Growth((edge.i, int(label)), (edge.j, other), *measured))
     return found

@@ -19,12 +19,15 @@ from scipy.sparse.linalg import spsolve
 
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
-from mvdyn_gtsam.refinement.growth import Growth
+from mvdyn_gtsam.refinement.growth import ONE_THING, Growth
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Labels = npt.NDArray[np.int32]
+Link = tuple[int, int, bool]
+"""Two regions of consecutive frames that have a thing in common, and whether they are that one alone: where
+people meet or part, the depth of what is called one region jumps."""
 
 SCATTER = 0.05
 """Error of an observed log depth that is common. Source: 0.05 to 0.2 compared on two scenes."""
@@ -35,7 +38,8 @@ CHANGE_OF_SPEED = 0.01
 """Change of that change from one frame to the next that is common: 18 m/s^2 at 2 m and 30 frames per second.
 Source: 0.004 to 0.02 compared on four rendered scenes, all within 2 % where the growth is measured."""
 LEAST_OVERLAP = 0.2
-"""Of two regions of consecutive frames that are one thing: shared pixels over those of the smaller."""
+"""Of two regions of consecutive frames that have a thing in common: shared pixels over those of the
+smaller."""
 SEEN, FARTHEST = 0.2, 0.3
 """Evidence from which a region's own depth bounds those of the same thing, and how far beyond, in log depth,
 they may lie where no growth is measured. Source: choice; a third nearer or farther."""
@@ -81,8 +85,8 @@ def depth_of_regions(
             labels = [
                 np.asarray(context.workspace.read(LABELS, f), np.int32) for f in (before, (camera, time))
             ]
-            for a, b in link(labels[0], labels[1]):
-                links.append((number[before, a], number[(camera, time), b]))
+            for a, b, alone in link(labels[0], labels[1]):
+                links.append((number[before, a], number[(camera, time), b], alone))
     result: dict[Frame, dict[int, KnownDepth]] = {frame: {} for frame in frames}
     if regions_found:
         still = standing_still(regions_found, links)
@@ -109,19 +113,20 @@ def depth_of_regions(
     return [result[frame] for frame in frames]
 
 
-def link(before: Labels, now: Labels) -> list[tuple[int, int]]:
-    """Labels of regions in images ``(h, w)`` of consecutive frames that overlap."""
+def link(before: Labels, now: Labels) -> list[Link]:
+    """Labels of regions in images ``(h, w)`` of consecutive frames that overlap, and whether they are one
+    thing."""
     both = (before > 0) & (now > 0)
     pairs, shared = np.unique(np.stack([before[both], now[both]]), axis=1, return_counts=True)
     sizes = (np.bincount(before.ravel()), np.bincount(now.ravel()))
     return [
-        (int(a), int(b))
+        (int(a), int(b), bool(count >= ONE_THING * max(sizes[0][a], sizes[1][b])))
         for (a, b), count in zip(pairs.T, shared, strict=True)
         if count >= LEAST_OVERLAP * min(sizes[0][a], sizes[1][b])
     ]
 
 
-def standing_still(regions: Sequence[RegionDepth], links: Sequence[tuple[int, int]]) -> Mask:
+def standing_still(regions: Sequence[RegionDepth], links: Sequence[Link]) -> Mask:
     """Which of ``regions`` stand still ``(N,)``: what other views say of each, if they mostly say so of those
     linked to it, up to ``STILL_STEPS`` frames away.
 
@@ -129,7 +134,7 @@ def standing_still(regions: Sequence[RegionDepth], links: Sequence[tuple[int, in
     """
     count = len(regions)
     still = np.array([region.still for region in regions], dtype=bool)
-    first, second = np.array(links, dtype=np.int64).reshape(-1, 2).T
+    first, second = np.array([pair[:2] for pair in links], dtype=np.int64).reshape(-1, 2).T
     ones = np.ones(len(first), dtype=np.int64)
     steps = sparse.csr_array((ones, (first, second)), shape=(count, count))
     steps = sparse.csr_array(steps + steps.T + sparse.eye_array(count, dtype=np.int64))
@@ -141,14 +146,14 @@ def standing_still(regions: Sequence[RegionDepth], links: Sequence[tuple[int, in
 
 def smooth_over_time(
     regions: Sequence[RegionDepth],
-    links: Sequence[tuple[int, int]],
+    links: Sequence[Link],
     growths: Sequence[tuple[int, int, float, float]] = (),
 ) -> tuple[Array, Array]:
     """Log inverse depth ``(N,)`` of ``regions``, and the evidence ``(N,)`` it has from all linked regions.
 
-    ``links`` are pairs of their numbers in consecutive frames, ``growths`` pairs of any two frames with the
-    log growth from the first to the second and its standard deviation. Robust least squares: an observation
-    counts by its evidence, and less the more the others contradict it.
+    ``links`` are pairs of their numbers in consecutive frames and whether they are one thing, ``growths``
+    pairs of any two frames with the log growth from the first to the second and its standard deviation.
+    Robust least squares: an observation counts by its evidence, and less the more the others contradict it.
     """
     count = len(regions)
     observed = np.array([region.log_inverse_depth for region in regions])
@@ -196,7 +201,7 @@ def strongest_around(evidence: Array, times: Array) -> Array:
 
 def on_the_ground(
     regions: Sequence[RegionDepth],
-    links: Sequence[tuple[int, int]],
+    links: Sequence[Link],
     growths: Sequence[tuple[int, int, float, float]],
 ) -> Array:
     """Log inverse depth ``(N,)`` of ``regions`` by where they stand, at this time or others; NaN where that
@@ -220,16 +225,16 @@ def on_the_ground(
     return np.where(belief > 0.0, np.maximum(solved, least), np.nan)
 
 
-def _evenness(links: Sequence[tuple[int, int]], count: int) -> sparse.csr_array:
-    """What pulls linked regions to one depth, and to a change of it that goes on, ``(N, N)``."""
-    difference = _differences(links, count)
+def _evenness(links: Sequence[Link], count: int) -> sparse.csr_array:
+    """What pulls linked regions to one depth, and those that are one thing to a change of it that goes on,
+    ``(N, N)``."""
+    linked = _differences([pair[:2] for pair in links], count)
+    difference = linked[np.flatnonzero([alone for _, _, alone in links])]
     starts, stops = sparse.csr_array(difference < 0.0), sparse.csr_array(difference > 0.0)
     # consecutive links: one stops where the next starts
     first, second = (stops.astype(np.int64) @ starts.T.astype(np.int64)).nonzero()
     bend = difference[first] - difference[second]
-    return sparse.csr_array(
-        difference.T @ difference / CHANGE_PER_STEP**2 + bend.T @ bend / CHANGE_OF_SPEED**2
-    )
+    return sparse.csr_array(linked.T @ linked / CHANGE_PER_STEP**2 + bend.T @ bend / CHANGE_OF_SPEED**2)
 
 
 def _differences(pairs: Sequence[tuple[int, int]], count: int) -> sparse.csr_array:

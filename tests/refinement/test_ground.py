@@ -7,7 +7,7 @@ import pytest
 
 from mvdyn_gtsam.refinement.ground import Footing, footing
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
-from mvdyn_gtsam.refinement.over_time import on_the_ground
+from mvdyn_gtsam.refinement.over_time import Link, on_the_ground
 
 
 def floor_and_wall() -> np.ndarray:
@@ -46,14 +46,14 @@ def test_of_a_thing_that_fills_the_border_nothing_is_known() -> None:
 
 def walking(
     feet_seen: list[bool],
-) -> tuple[list[RegionDepth], list[tuple[int, int]], list[tuple[int, int, float, float]]]:
+) -> tuple[list[RegionDepth], list[Link], list[tuple[int, int, float, float]]]:
     """It comes nearer by 2 % a frame; where its feet are outside the border is as far as at first."""
     true = 0.02 * np.arange(len(feet_seen))
     regions = [
         RegionDepth((0, t), 1, 3.0, 0.0, footing=Footing(true[t] if seen else 0.0, seen))
         for t, seen in enumerate(feet_seen)
     ]
-    links = [(t, t + 1) for t in range(len(true) - 1)]
+    links = [(t, t + 1, True) for t in range(len(true) - 1)]
     growths = [(t, t + k, true[t + k] - true[t], 0.01) for k in (2, 4) for t in range(len(true) - k)]
     return regions, links, growths
 
@@ -70,4 +70,4 @@ def test_a_thing_without_feet_is_at_least_as_near_as_the_border() -> None:
 
 def test_what_never_touches_the_ground_is_nowhere() -> None:
     regions = [RegionDepth((0, t), 1, 3.0, 0.0) for t in range(4)]
-    assert np.isnan(on_the_ground(regions, [(0, 1), (1, 2), (2, 3)], [])).all()
+    assert np.isnan(on_the_ground(regions, [(0, 1, True), (1, 2, True), (2, 3, True)], [])).all()

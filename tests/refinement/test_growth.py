@@ -97,7 +97,7 @@ def test_depth_follows_the_growth_where_no_other_camera_sees() -> None:
     regions = [
         RegionDepth((0, t), 1, true[t] if t >= 24 else 2.0, 1.0 if t >= 24 else 0.0) for t in range(30)
     ]
-    links = [(t, t + 1) for t in range(29)]
+    links = [(t, t + 1, True) for t in range(29)]
     growths = [(t, t + k, true[t + k] - true[t], SIGMA) for k in (2, 4) for t in range(30 - k)]
     growths[5] = (*growths[5][:2], 0.7, SIGMA)  # one is wrong
     solved, _ = smooth_over_time(regions, links, growths)

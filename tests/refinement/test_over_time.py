@@ -8,6 +8,7 @@ from mvdyn_gtsam.refinement.moving_depth import RegionDepth
 from mvdyn_gtsam.refinement.over_time import (
     FADING_STEPS,
     FARTHEST,
+    Link,
     link,
     smooth_over_time,
     standing_still,
@@ -21,7 +22,7 @@ def test_regions_that_overlap_are_one_thing() -> None:
     before, now = np.zeros(SHAPE, np.int32), np.zeros(SHAPE, np.int32)
     before[10:20, 10:20], before[40:50, 10:20] = 1, 2
     now[10:20, 14:24], now[40:50, 19:40] = 2, 1
-    assert link(before, now) == [(1, 2)]
+    assert link(before, now) == [(1, 2, True)]
     assert link(before, np.zeros(SHAPE, np.int32)) == []
 
 
@@ -30,8 +31,8 @@ def walk(count: int, wrong: dict[int, float], evidence: dict[int, float]) -> lis
     return [RegionDepth((0, t), 1, wrong.get(t, -0.01 * t), evidence.get(t, 1.0)) for t in range(count)]
 
 
-def chain(count: int) -> list[tuple[int, int]]:
-    return [(t, t + 1) for t in range(count - 1)]
+def chain(count: int) -> list[Link]:
+    return [(t, t + 1, True) for t in range(count - 1)]
 
 
 def test_a_wrong_instant_gives_way_to_those_around() -> None:
@@ -48,6 +49,22 @@ def test_frames_without_evidence_take_it_from_the_nearest_with() -> None:
     # it walks evenly, also before anybody saw it
     np.testing.assert_allclose(solved, -0.01 * np.arange(20), atol=0.02)
     assert (np.diff(belief[:8]) > 0.0).all()
+
+
+def test_regions_that_meet_are_no_longer_one_thing() -> None:
+    before, now = np.zeros(SHAPE, np.int32), np.zeros(SHAPE, np.int32)
+    before[10:20, 10:20], before[10:20, 22:60] = 1, 2
+    now[10:20, 10:60] = 1
+    assert link(before, now) == [(1, 1, False), (2, 1, True)]
+
+
+def test_depth_may_jump_where_things_part() -> None:
+    """Ten frames of two people as one region, whose depth is that of the farther one; then each alone."""
+    together = [RegionDepth((0, t), 1, -1.0, 0.8) for t in range(10)]
+    near = [RegionDepth((0, t), 2, -0.4, 1.0) for t in range(10, 20)]
+    links: list[Link] = [(t, t + 1, t != 9) for t in range(19)]
+    solved, _ = smooth_over_time(together + near, links)
+    np.testing.assert_allclose(solved, [-1.0] * 10 + [-0.4] * 10, atol=0.05)
 
 
 def test_evidence_fades_with_the_frames_in_between() -> None:
@@ -69,7 +86,7 @@ def test_even_motion_ends_where_the_scene_does() -> None:
 
 def test_regions_apart_do_not_touch_each_other() -> None:
     regions = walk(3, {}, {}) + [RegionDepth((1, t), 1, 2.0, 0.0) for t in range(3)]
-    solved, belief = smooth_over_time(regions, [(0, 1), (1, 2), (3, 4), (4, 5)])
+    solved, belief = smooth_over_time(regions, [(0, 1, True), (1, 2, True), (3, 4, True), (4, 5, True)])
     np.testing.assert_allclose(solved[3:], 2.0)
     assert (belief[3:] == 0.0).all()
     assert (belief[:3] > 0.5).all()
@@ -101,5 +118,7 @@ def test_what_mostly_stands_still_does_where_it_is_seen_to() -> None:
 
 def test_other_things_have_no_say_in_whether_one_stands_still() -> None:
     regions = still_regions([True]) + still_regions([False] * 4) + still_regions([True], 30)
-    assert standing_still(regions, [(1, 2), (2, 3), (3, 4)]).tolist() == [True] + [False] * 4 + [True]
+    assert standing_still(regions, [(1, 2, True), (2, 3, True), (3, 4, True)]).tolist() == [True] + [
+        False
+    ] * 4 + [True]
     assert standing_still(regions[:1], []).tolist() == [True]
