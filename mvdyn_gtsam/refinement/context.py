@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig
 from mvdyn_gtsam.graph.connections import Frame
-from mvdyn_gtsam.refinement.edges import Edge, load_edges
-from mvdyn_gtsam.refinement.initial import FlowTargets
+from mvdyn_gtsam.refinement.edges import Edge, FlowTargets, load_edges
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
@@ -26,8 +25,6 @@ surroundings'."""
 STATIC, MOVING, UNEXPLAINED = 0, 1, 2
 """Of the array ``moving``: nothing moves; it moves and the views of its instant tell its depth; they do
 not."""
-
-
 COLOUR = "colour"
 """The array of what ``smooth_colour`` makes of the images."""
 TARGETS = "flow targets"

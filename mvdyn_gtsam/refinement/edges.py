@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,6 +21,8 @@ Array = npt.NDArray[np.float64]
 
 LEAST_WEIGHT = 0.02
 """Flow trusted less is left out: it would cost as much time as any."""
+SURE_WEIGHT = 0.2
+"""Weight of flow that may say that something moves: on plain walls flow errs."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,25 @@ def load_edges(
             )
         )
     return edges
+
+
+@dataclass(frozen=True)
+class FlowTargets:
+    """Where sure flow finds the ``N`` pixels of a frame at ``K`` other times of its camera."""
+
+    times: npt.NDArray[np.int32]
+    """``(K,)``"""
+    pixels: npt.NDArray[np.int32]
+    """``(K, N)`` flat indices; -1 where flow is not sure, or leads outside."""
+
+
+def flow_targets(edges: Sequence[Edge], pixels: int) -> FlowTargets:
+    """Of a frame of so many ``pixels`` and its ``edges`` within the camera."""
+    table = np.full((len(edges), pixels), -1, np.int32)
+    for row, edge in zip(table, edges, strict=True):
+        sure = edge.weight >= SURE_WEIGHT
+        row[edge.pixels[sure]] = edge.nearest[sure]
+    return FlowTargets(np.array([edge.j[1] for edge in edges], dtype=np.int32), table)
 
 
 def _in_full_pixels(small: Float32, view: DenseView) -> Float32:

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import LABELS, Context
-from mvdyn_gtsam.refinement.edges import Edge
-from mvdyn_gtsam.refinement.initial import SURE_WEIGHT
+from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge
 from mvdyn_gtsam.refinement.reprojection import CORRELATED_PX
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 
@@ -127,8 +126,10 @@ def growths_along(
         measured = vertical_growth(
             edge.rays[shared, :2] * focal, edge.target[shared], edge.weight[shared], independent
         )
-        # what is shared there, in the pixels there
-        covered = len(shared) * np.exp(2.0 * measured[0]) if measured is not None else 0.0
-        if measured is not None and covered >= ONE_THING * np.count_nonzero(labels_there == other):
+        if measured is None:
+            continue
+        # what is shared, in the pixels of the other frame
+        covered = len(shared) * np.exp(2.0 * measured[0])
+        if covered >= ONE_THING * np.count_nonzero(labels_there == other):
             found.append(Growth((edge.i, int(label)), (edge.j, other), *measured))
     return found

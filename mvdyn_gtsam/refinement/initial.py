@@ -4,7 +4,6 @@ best, and for what moves a depth from the views of its instant."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.refinement.depth import robust_cost
-from mvdyn_gtsam.refinement.edges import Edge
+from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, FlowTargets
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 
 Mask = npt.NDArray[np.bool_]
@@ -21,8 +20,6 @@ BOX = 5
 """Side of the square over which costs are averaged before a pixel decides, px of the view."""
 SCORING_EDGES = 6
 """Edges that judge the candidates, those that see most parallax."""
-SURE_WEIGHT = 0.2
-"""Weight of flow that may say that something moves: on plain walls flow errs."""
 STILL_VIEWS, STILL_SIDE = 2, 5
 """Frames that must see a pixel stand still, and side of the least square that does, px of the view. Source:
 as ``RefinementConfig.still_px``."""
@@ -103,25 +100,6 @@ def failing_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[
         if strong[region].mean() > 0.3:
             result[region] = 1
     return result
-
-
-@dataclass(frozen=True)
-class FlowTargets:
-    """Where sure flow finds the ``N`` pixels of a frame at ``K`` other times of its camera."""
-
-    times: npt.NDArray[np.int32]
-    """``(K,)``"""
-    pixels: npt.NDArray[np.int32]
-    """``(K, N)`` flat indices; -1 where flow is not sure, or leads outside."""
-
-
-def flow_targets(edges: Sequence[Edge], pixels: int) -> FlowTargets:
-    """Of a frame of so many ``pixels`` and its ``edges`` within the camera."""
-    table = np.full((len(edges), pixels), -1, np.int32)
-    for row, edge in zip(table, edges, strict=True):
-        sure = edge.weight >= SURE_WEIGHT
-        row[edge.pixels[sure]] = edge.nearest[sure]
-    return FlowTargets(np.array([edge.j[1] for edge in edges], dtype=np.int32), table)
 
 
 def moving_regions(

@@ -18,13 +18,11 @@ from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import Pair
 from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
 from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
-from mvdyn_gtsam.refinement.edges import Edge, load_edges
+from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, flow_targets, load_edges
 from mvdyn_gtsam.refinement.growth import growth_task
 from mvdyn_gtsam.refinement.initial import (
-    SURE_WEIGHT,
     best_candidate,
     failing_regions,
-    flow_targets,
     most_telling,
     static_residual,
 )

@@ -11,15 +11,12 @@ import pytest
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
-from mvdyn_gtsam.refinement.edges import Edge
+from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, FlowTargets, flow_targets
 from mvdyn_gtsam.refinement.initial import (
-    SURE_WEIGHT,
-    FlowTargets,
     _triangulated,
     best_candidate,
     carried_regions,
     failing_regions,
-    flow_targets,
     most_telling,
     moving_regions,
     proven_still,

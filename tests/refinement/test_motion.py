@@ -9,7 +9,7 @@ import numpy as np
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
 from mvdyn_gtsam.refinement.context import Context
-from mvdyn_gtsam.refinement.initial import flow_targets
+from mvdyn_gtsam.refinement.edges import flow_targets
 from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, carry_task, kept_far_off
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView
