@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from types import TracebackType
 
@@ -36,7 +36,7 @@ class TaskPool:
         self._executor: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> TaskPool:
-        """Raises ConfigError where the flow cannot travel to processes, ResultError where none starts."""
+        """Raises ConfigError where the flow cannot travel to processes."""
         if self._workers > 1:
             try:
                 pickle.dumps(self._context)
@@ -54,10 +54,10 @@ class TaskPool:
                     _receive,
                     (self._context, os.getpid()),
                 )
-                # processes start with the first job; they must see the variable
-                list(self._executor.map(_ready, range(self._workers)))
-            except BrokenProcessPool as error:
-                raise _broken() from error
+                # each starts with a job, while the environment is as it must see it; nobody waits for them,
+                # since the first step needs none
+                for _ in range(self._workers):
+                    self._executor.submit(_ready)
             finally:
                 if threads is None:
                     del os.environ["OPENBLAS_NUM_THREADS"]
@@ -79,8 +79,9 @@ class TaskPool:
             return
         # a few jobs ahead of the reader: results are images, and memory must not grow with the video
         ahead = 4 * self._workers
-        pending = [self._executor.submit(_run, task, job) for job in jobs[:ahead]]
+        pending: list[Future[object]] = []
         try:
+            pending += [self._executor.submit(_run, task, job) for job in jobs[:ahead]]
             for index in range(len(jobs)):
                 if index + ahead < len(jobs):
                     pending.append(self._executor.submit(_run, task, jobs[index + ahead]))
@@ -124,7 +125,7 @@ def _leave_with(parent: int) -> None:
     os._exit(1)
 
 
-def _ready(_: int) -> None:
+def _ready() -> None:
     """Does nothing: makes the processes start."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -31,10 +32,11 @@ class DenseView:
     @staticmethod
     def of(camera: Camera, scale: float) -> DenseView:
         """The view whose images are ``scale`` times the camera's."""
-        shape = (max(1, round(camera.height * scale)), max(1, round(camera.width * scale)))
-        intrinsics = scaled_intrinsics(camera.intrinsics, shape[1] / camera.width, shape[0] / camera.height)
-        raster = pixel_raster(shape).reshape(-1, 2).astype(np.float64)
-        return DenseView(camera, shape, intrinsics, pixel_rays(raster, intrinsics).astype(np.float32))
+        return _view(camera, (max(1, round(camera.height * scale)), max(1, round(camera.width * scale))))
+
+    def __reduce__(self) -> tuple[Callable[..., DenseView], tuple[Camera, tuple[int, int]]]:
+        """Without the rays: a megabyte that a process makes sooner than it receives."""
+        return _view, (self.camera, self.shape)
 
     def shrink(self, image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
         """``image (H, W[, C])`` averaged down to ``shape``."""
@@ -48,6 +50,12 @@ class DenseView:
         if image.shape == size[::-1]:
             return image
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR))
+
+
+def _view(camera: Camera, shape: tuple[int, int]) -> DenseView:
+    intrinsics = scaled_intrinsics(camera.intrinsics, shape[1] / camera.width, shape[0] / camera.height)
+    raster = pixel_raster(shape).reshape(-1, 2).astype(np.float64)
+    return DenseView(camera, shape, intrinsics, pixel_rays(raster, intrinsics).astype(np.float32))
 
 
 def scaled_intrinsics(intrinsics: Array, scale_x: float, scale_y: float) -> Array:

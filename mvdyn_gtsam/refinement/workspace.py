@@ -238,14 +238,12 @@ class Workspace:
 
 
 def _write_zeros(path: Path, dtype: np.dtype[np.generic], shape: tuple[int, ...]) -> None:
-    """A whole ``.npy`` or none, its space taken: a map over a hole kills the process on a full disk."""
+    """A whole ``.npy`` or none. It takes space as its images are written: zeros would take as long."""
     temporary = path.with_name(f".{path.name}.part")
     header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-    image = np.zeros(shape[1:], dtype).tobytes()
     with temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)
-        for _ in range(shape[0]):
-            file.write(image)
+        file.truncate(file.tell() + math.prod(shape) * dtype.itemsize)
     temporary.replace(path)
 
 

@@ -82,8 +82,8 @@ def test_what_goes_wrong_is_told_with_its_remedy(
 ) -> None:
     work = context(tmp_path)
     broken = Context(work.workspace, work.groups, {}, work.config, flow, work.flow_config)
-    with pytest.raises(error, match=message), TaskPool(broken, 2):
-        pass
+    with pytest.raises(error, match=message), TaskPool(broken, 2) as pool:
+        list(pool.map("window", windows("before", "after", 6, 2, 1)))
 
 
 def test_zero_workers_means_one_per_processor() -> None:
@@ -124,3 +124,11 @@ def _runs(process: int) -> bool:
     except FileNotFoundError:
         return False
     return state != "Z"
+
+
+def test_windows_cover_all_times_and_are_alike() -> None:
+    bounds = [job[2:4] for job in windows("before", "after", 61, 8, 1)]
+    assert bounds[0][0] == 0 and bounds[-1][1] == 61
+    assert all(end == first for (_, end), (first, _) in zip(bounds, bounds[1:], strict=False))
+    lengths = {end - first for first, end in bounds}
+    assert max(lengths) <= 8 and max(lengths) - min(lengths) <= 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -25,6 +27,17 @@ def cameras(draw: st.DrawFn) -> Camera:
     fx, fy = draw(st.floats(20.0, 300.0)), draw(st.floats(20.0, 300.0))
     cx, cy = draw(st.floats(0.3, 0.7)) * width, draw(st.floats(0.3, 0.7)) * height
     return Camera("c", width, height, fx, fy, cx, cy)
+
+
+@given(cameras(), st.floats(0.1, 1.0))
+def test_a_view_travels_light_and_arrives_whole(camera: Camera, scale: float) -> None:
+    view = DenseView.of(camera, scale)
+    sent = pickle.dumps(view)
+    received = pickle.loads(sent)
+    assert len(sent) < 1000
+    assert (received.camera, received.shape) == (view.camera, view.shape)
+    np.testing.assert_array_equal(received.intrinsics, view.intrinsics)
+    np.testing.assert_array_equal(received.rays, view.rays)
 
 
 @given(cameras(), st.floats(0.1, 1.0), st.integers(0, 10**6))

@@ -158,12 +158,11 @@ def test_making_an_array_again_keeps_it(tmp_path: Path) -> None:
     assert (kept.read("depth", (0, 2)) == 1.0).all()
 
 
-def test_an_array_takes_its_space_when_it_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not when its pages are written to: that would kill the process instead of raising an error."""
+def test_an_array_is_made_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = workspace(tmp_path)
     kept.create("depth")
-    path = kept.folder / "depth_0.npy"
-    assert path.stat().st_blocks * 512 >= 5 * 16 * 24 * 4
+    assert (kept.folder / "depth_0.npy").stat().st_size > 5 * 16 * 24 * 4
+    assert (np.load(kept.folder / "depth_0.npy") == 0.0).all()
 
     def full(file: io.BufferedWriter, header: dict[str, object]) -> None:
         file.write(b"half")
@@ -173,6 +172,17 @@ def test_an_array_takes_its_space_when_it_is_made(tmp_path: Path, monkeypatch: p
     with pytest.raises(ResultError, match=r"swept_0.npy: cannot be written \(No space left"):
         kept.create("swept")
     assert not (kept.folder / "swept_0.npy").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a disk that is always full")
+def test_an_image_that_the_disk_cannot_hold_is_told(tmp_path: Path) -> None:
+    kept = workspace(tmp_path)
+    kept.create("depth")
+    image, path = kept.read("depth", (0, 2)), kept.folder / "depth_0.npy"
+    path.unlink()
+    path.symlink_to("/dev/full")
+    with pytest.raises(ResultError, match=r"depth_0.npy: cannot be written \(No space left"):
+        kept.write("depth", (0, 2), image)
 
 
 def test_what_is_read_is_a_copy(tmp_path: Path) -> None:
