@@ -15,12 +15,14 @@ from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.neighbours import times_in_view
 from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.views import DenseView
+from mvdyn_gtsam.refinement.views import DenseView, pixels_seen
 from mvdyn_gtsam.refinement.workspace import Workspace
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
+CARRIED_STEPS = 3
+"""Of the fixed point that finds a pixel of one frame in another one swept. Source: choice."""
 MARGIN = 8
 """Pixels of the swept size around what moves that are swept with it: its outline in other cameras is that
 unsure. Source: choice."""
@@ -46,6 +48,28 @@ def sweep_frame(
     )
     size = workspace.views[frame[0]].shape[::-1]
     return np.asarray(cv2.resize(found, size, interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def carry_sweep(workspace: Workspace, frame: Frame, swept: Frame, wTc: Array) -> Float32:
+    """Inverse depth of a frame at the view's size, from that of another frame of its camera that was
+    ``swept``.
+
+    Each pixel takes the depth of the pixel that sees its point there: a fixed point, since where that is
+    depends on the depth. ``wTc (N, T, 4, 4)``. Reads ``swept`` of the workspace.
+    """
+    view = workspace.views[frame[0]]
+    jTi = invert_pose(wTc[swept]) @ wTc[frame]
+    there = np.asarray(workspace.read("swept", swept), np.float32)
+    found = there.ravel()
+    depth_of_rays = view.rays @ jTi[2, :3].astype(np.float32)
+    for _ in range(CARRIED_STEPS):
+        at, front = pixels_seen(found, view.rays, jTi, view.intrinsics)
+        seen = cv2.remap(
+            there, at.reshape(*view.shape, 2), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        depth_ratio = depth_of_rays + np.float32(jTi[2, 3]) * found
+        found = np.where(front, seen.ravel() * depth_ratio, found)
+    return found.reshape(view.shape)
 
 
 def sweep_moving(

@@ -24,6 +24,7 @@ from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_p
 from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context, smooth_colour
 from mvdyn_gtsam.refinement.growth import Growth
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
+from mvdyn_gtsam.refinement.neighbours import swept_times
 from mvdyn_gtsam.refinement.over_time import depth_of_regions
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
 from mvdyn_gtsam.refinement.poses import solve_poses
@@ -146,7 +147,7 @@ class Refinement:
         settings = (WORKSPACE_FORMAT, replace(config, workers=0), self._context.flow_config)
         self._workspace.prepare(repr(settings))
         self._step("images", self._store_images)
-        self._step("sweep", lambda: self._map("sweep", self._frames))
+        self._step("sweep", self._sweep)
         self._step("temporal flow", lambda: self._map("temporal flow", self._within))
         if config.phase1:
             self._step("phase 1", self._align)
@@ -224,6 +225,15 @@ class Refinement:
         workspace.write_array("tracked_poses", tracked.wTc)
         ones, zeros = np.ones(tracked.wTc.shape[:2]), np.zeros(tracked.wTc.shape[:2])
         workspace.write_array("scales", np.stack([ones, zeros]))
+
+    def _sweep(self) -> None:
+        """Depth by plane sweep; while the image hardly moves, of one frame for those around."""
+        wTc, reach = self._context.poses(), self._config.sweep_reach
+        times = [swept_times(self._workspace, c, wTc, reach) for c in range(len(self._tracked.cameras))]
+        source = {frame: (frame[0], times[frame[0]][frame[1]]) for frame in self._frames}
+        self._map("sweep", [frame for frame in self._frames if source[frame] == frame])
+        others = [(frame, source[frame]) for frame in self._frames if source[frame] != frame]
+        self._map("carry sweep", others)
 
     def _carry(self, source: str, target: str) -> None:
         self._map("carry", [(source, target, frame) for frame in self._frames])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -26,7 +27,7 @@ from mvdyn_gtsam.refinement.initial import (
     most_telling,
     static_residual,
 )
-from mvdyn_gtsam.refinement.measurement import measure_pair, sweep_frame, sweep_moving
+from mvdyn_gtsam.refinement.measurement import carry_sweep, measure_pair, sweep_frame, sweep_moving
 from mvdyn_gtsam.refinement.motion import (
     carry_task,
     free_space_task,
@@ -62,6 +63,12 @@ def sweep_task(context: Context, frame: Frame) -> None:
     group = context.group_of(frame[0])
     swept = sweep_frame(context.workspace, frame, group, context.poses(), context.config.sweep)
     context.workspace.write("swept", frame, swept)
+
+
+def carry_sweep_task(context: Context, job: tuple[Frame, Frame]) -> None:
+    """Depth of a frame from that of another frame of its camera that was swept: ``(frame, swept)``."""
+    frame, swept = job
+    context.workspace.write("swept", frame, carry_sweep(context.workspace, frame, swept, context.poses()))
 
 
 def instant_task(context: Context, frame: Frame) -> None:
@@ -328,6 +335,7 @@ def run_task(context: Context, task: str, job: object) -> object:
 
 TASKS = {
     "sweep": sweep_task,
+    "carry sweep": carry_sweep_task,
     "temporal flow": temporal_flow_task,
     "wide flow": wide_flow_task,
     "begin": begin_task,
@@ -349,5 +357,7 @@ TASKS = {
 def windows(
     source: str, target: str, frame_count: int, length: int, steps: int
 ) -> Sequence[tuple[str, str, int, int, int]]:
-    """Jobs of ``window_task`` that cover all times."""
-    return [(source, target, t, min(t + length, frame_count), steps) for t in range(0, frame_count, length)]
+    """Jobs of ``window_task`` that cover all times, of ``length`` or a little less: all alike, so that no
+    process waits for the last."""
+    bounds = np.linspace(0, frame_count, -(-frame_count // length) + 1).round().astype(int).tolist()
+    return [(source, target, first, end, steps) for first, end in pairwise(bounds)]

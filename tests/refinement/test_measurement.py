@@ -9,7 +9,7 @@ import pytest
 
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.plane_sweep import SweepConfig
-from mvdyn_gtsam.refinement.measurement import sweep_frame, sweep_moving
+from mvdyn_gtsam.refinement.measurement import carry_sweep, sweep_frame, sweep_moving
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 from tests.frontend.test_plane_sweep import BOARD, SHAPE, TRUTH, inner, pose, render
@@ -48,3 +48,17 @@ def test_what_moves_is_swept_alone_and_the_rest_left(filmed: Workspace) -> None:
     beside[rows.min() - 9 : rows.max() + 10, columns.min() - 9 : columns.max() + 10] = False
     assert beside.any()
     np.testing.assert_allclose(found[beside], 0.1)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 2.0])
+def test_swept_depth_is_carried_to_another_time(filmed: Workspace, turn_deg: float) -> None:
+    """Of a frame a step aside and ahead: at its own pixels, as its own depth."""
+    there = pose(0.08, 0.02, 0.15, turn_deg)
+    filmed.write("swept", (1, 0), render(there)[1])
+    carried = carry_sweep(filmed, (0, 0), (1, 0), np.array([POSES[0], there, POSES[2]])[:, None])
+    wall = inner(~BOARD, 6) & (np.indices(SHAPE)[1] > 8)
+    for surface in (inner(BOARD, 6), wall):
+        assert np.median(np.abs(carried / TRUTH - 1.0)[surface]) < 0.003
+        assert np.percentile(np.abs(carried / TRUTH - 1.0)[surface], 95) < 0.02
+        # and not because nothing had changed
+        assert np.median(np.abs(render(there)[1] / TRUTH - 1.0)[surface]) > 0.01

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mvdyn_gtsam.capture.model import Camera
-from mvdyn_gtsam.refinement.neighbours import times_in_view
+from mvdyn_gtsam.refinement.neighbours import middles, swept_times, times_in_view
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
@@ -53,3 +55,33 @@ def test_the_fastest_is_compared_with_its_neighbours(wall: Workspace) -> None:
 def test_at_the_ends_of_the_video_only_what_there_is(wall: Workspace) -> None:
     assert times_in_view(wall, (0, 0), moving(0.1), OFFSETS, SHARED) == [4, 16]
     assert times_in_view(wall, (0, FRAMES - 3), moving(0.1), OFFSETS, SHARED) == [21, 33, 39]
+
+
+def test_slow_frames_share_the_depth_of_one_in_their_middle(wall: Workspace) -> None:
+    # 0.2 of 32 px per frame: three frames are 0.6 px, 0.02 of the width
+    served = swept_times(wall, 0, moving(0.2), 0.02)
+    assert served[:14] == [3] * 7 + [10] * 7
+    assert served == swept_times(wall, 0, moving(-0.2), 0.02)
+
+
+def test_fast_ones_are_all_swept(wall: Workspace) -> None:
+    assert swept_times(wall, 0, moving(1.0), 0.02) == list(range(FRAMES))
+    assert swept_times(wall, 0, moving(0.2), 0.0) == list(range(FRAMES))
+
+
+def test_a_camera_that_turns_round_is_fast(wall: Workspace) -> None:
+    """Points behind it count as far away."""
+    wTc = moving(0.0)
+    wTc[0, 20:, 0, 0] = wTc[0, 20:, 2, 2] = -1.0
+    served = swept_times(wall, 0, wTc, 0.02)
+    assert max(served[:20]) < 20 <= min(served[20:])
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=40), st.floats(0.0, 1.0))
+def test_nobody_is_farther_from_the_middle_than_allowed(steps: list[float], reach: float) -> None:
+    way = np.cumsum(steps)
+    found = middles(way, reach)
+    assert len(found) == len(way)
+    assert all(abs(way[i] - way[middle]) <= reach + 1e-9 for i, middle in enumerate(found))
+    assert all(found[middle] == middle for middle in found)
+    assert found == sorted(found)
