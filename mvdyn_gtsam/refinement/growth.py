@@ -56,6 +56,11 @@ class Growth:
     """Its standard deviation."""
 
 
+def is_one_thing(shared: int, size: int, size_there: int) -> bool:
+    """Whether two regions that share so many pixels are."""
+    return bool(shared >= ONE_THING * max(size, size_there))
+
+
 def vertical_growth(
     here: Float32, there: Float32, weight: Float32, independent: float
 ) -> tuple[float, float] | None:

@@ -1,9 +1,10 @@
 """What moves in a frame, and where phase 2 begins with it.
 
-Seven steps, since a frame asks others: ``free_space_task`` adds what other views see through to where the
+Eight steps, since a frame asks others: ``free_space_task`` adds what other views see through to where the
 static model fails; ``carry_task`` what moves before and after; ``settle_task`` finds what moves and its
 outline; ``observe_task`` asks the cameras of the instant for the depth of each region, ``growth_task`` the
-frames after for how it grows; ``depth_of_regions`` makes that one over time; ``moving_depth_task`` writes it.
+frames after for how it grows; ``depth_of_regions`` makes that one over time; ``moving_depth_task`` writes it;
+``relief_task`` makes one over time how the points of a region lie about its depth.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from mvdyn_gtsam.refinement.moving_depth import (
 from mvdyn_gtsam.refinement.outline import OtherTime, background, depth_behind, grown, outlined
 from mvdyn_gtsam.refinement.over_time import KnownDepth
 from mvdyn_gtsam.refinement.parts import depth_of_parts
+from mvdyn_gtsam.refinement.relief import RELIEF
 from mvdyn_gtsam.refinement.views import pixels_seen
 
 Mask = npt.NDArray[np.bool_]
@@ -242,7 +244,7 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]
     instant, rays = context.image("instant", frame), workspace.views[frame[0]].rays
     # what other frames' tasks change of these views meanwhile lies where something moves, and is not read
     views, wide_views = (_instant_views(context, frame, margin) if depths else [] for margin in (1, MARGIN))
-    grey = context.luminance(frame)
+    grey, relief = context.luminance(frame), np.full(labels.shape, np.nan, np.float32)
     for label, known in depths.items():
         region = labels == label
         moving[region] = known.moving
@@ -256,11 +258,14 @@ def moving_depth_task(context: Context, job: tuple[Frame, dict[int, KnownDepth]]
             matched = matched + side_seen(matched, rays[region.ravel()], views)
         # nothing lies behind its background, which is known only about
         theta[region] = np.maximum(matched, theta[region] - BEHIND)
+        if known.moving == MOVING:
+            relief[region] = theta[region] - np.float32(known.log_inverse_depth)
     weight[labels > 0] = config.moving_sigma**-2
     workspace.write("prior", frame, theta)
     workspace.write("prior_weight", frame, weight)
     workspace.write("moving", frame, moving)
     workspace.write("begun", frame, np.exp(theta))
+    workspace.write(RELIEF, frame, relief)
 
 
 def kept_far_off(moves: Mask) -> Float32:

@@ -19,7 +19,7 @@ from scipy.sparse.linalg import spsolve
 
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
-from mvdyn_gtsam.refinement.growth import ONE_THING, Growth
+from mvdyn_gtsam.refinement.growth import Growth, is_one_thing
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
 
 Array = npt.NDArray[np.float64]
@@ -120,7 +120,7 @@ def link(before: Labels, now: Labels) -> list[Link]:
     pairs, shared = np.unique(np.stack([before[both], now[both]]), axis=1, return_counts=True)
     sizes = (np.bincount(before.ravel()), np.bincount(now.ravel()))
     return [
-        (int(a), int(b), bool(count >= ONE_THING * max(sizes[0][a], sizes[1][b])))
+        (int(a), int(b), is_one_thing(count, sizes[0][a], sizes[1][b]))
         for (a, b), count in zip(pairs.T, shared, strict=True)
         if count >= LEAST_OVERLAP * min(sizes[0][a], sizes[1][b])
     ]

@@ -28,6 +28,7 @@ from mvdyn_gtsam.refinement.neighbours import swept_times
 from mvdyn_gtsam.refinement.over_time import depth_of_regions
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
 from mvdyn_gtsam.refinement.poses import solve_poses
+from mvdyn_gtsam.refinement.relief import RELIEF
 from mvdyn_gtsam.refinement.samples import FrameSample, SampleStore
 from mvdyn_gtsam.refinement.scale import solve_scales
 from mvdyn_gtsam.refinement.settings import RefinementConfig
@@ -41,10 +42,10 @@ Array = npt.NDArray[np.float64]
 
 BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
-BYTES_PER_PIXEL = 93.0
-"""Of a view on disk besides its flow: thirteen arrays of 32 bits, nine of 8, and where flow leads at about
+BYTES_PER_PIXEL = 97.0
+"""Of a view on disk besides its flow: fourteen arrays of 32 bits, nine of 8, and where flow leads at about
 eight other times."""
-WORKSPACE_FORMAT = 2
+WORKSPACE_FORMAT = 3
 """Raised when what lies on disk changes: a refinement that an earlier version began is begun anew."""
 FAILS, CARRIED = "fails", "carried"
 """The arrays of where the static model fails that ``carry`` reads and writes in turn."""
@@ -204,7 +205,7 @@ class Refinement:
         workspace.create(LABELS, np.uint8)
         for name in (
             "tracked", "tracked_confidence", "aligned", "swept", "instant", "prior", "prior_weight", "first",
-            "begun", "information",
+            "begun", "information", RELIEF,
         ):  # fmt: skip
             workspace.create(name)
         for done, frame in enumerate(self._frames):
@@ -253,6 +254,7 @@ class Refinement:
             grown.append(growths)
         depths = depth_of_regions(self._context, self._frames, found, grown)
         self._map("moving depth", list(zip(self._frames, depths, strict=True)))
+        self._map("relief", self._frames)
 
     def _sample(self) -> Callable[[], Iterable[FrameSample]]:
         """Sample every frame once; what is returned reads them back, as often as a solve asks."""

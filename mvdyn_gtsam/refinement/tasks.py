@@ -37,6 +37,7 @@ from mvdyn_gtsam.refinement.motion import (
 )
 from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
 from mvdyn_gtsam.refinement.planes import PlainRegion, fill_plain, plain_regions, planes_in_world
+from mvdyn_gtsam.refinement.relief import relief_task
 from mvdyn_gtsam.refinement.samples import FrameSample
 
 Array = npt.NDArray[np.float64]
@@ -346,6 +347,7 @@ TASKS = {
     "observe": observe_task,
     "growth": growth_task,
     "moving depth": moving_depth_task,
+    "relief": relief_task,
     "window": window_task,
     "planes": planes_task,
     "plain regions": fill_task,
