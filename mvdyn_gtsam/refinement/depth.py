@@ -110,13 +110,27 @@ def solve_frame(
         # depth edges are found coarse to fine: a wide kernel first
         widening = min(WIDEST_KERNEL, 2.0 ** max(0, iterations - 2 - iteration))
         normal = normal_equations(theta, problem, widening)
-        preconditioner = sparse.dia_array((1.0 / normal.matrix.diagonal()[None], [0]), normal.matrix.shape)
-        step, _ = cg(
-            normal.matrix, -normal.gradient, rtol=SOLVER_TOLERANCE, maxiter=SOLVER_STEPS, M=preconditioner
-        )
+        step = _solved(normal)
         theta = theta + np.clip(step, -LARGEST_STEP, LARGEST_STEP).reshape(theta.shape).astype(np.float32)
         information = normal.information.reshape(theta.shape)
     return theta, information
+
+
+def _solved(normal: Normal) -> Float32:
+    """The Gauss-Newton step ``(N,)``.
+
+    The diagonal as preconditioner is put into the system, ``(S A S) (S^-1 x) = S b`` with ``S`` the inverse
+    root of the diagonal: applied in every iteration it took a sixth of the solve.
+    """
+    offsets, bands = normal.matrix.offsets, normal.matrix.data
+    scale = 1.0 / np.sqrt(normal.matrix.diagonal())
+    # entry k of the diagonal with offset d belongs to column k and row k - d; beyond the ends bands are zero
+    scaled = np.stack(
+        [band * scale * np.roll(scale, offset) for band, offset in zip(bands, offsets, strict=True)]
+    )
+    matrix = sparse.dia_array((scaled, offsets), normal.matrix.shape)
+    step, _ = cg(matrix, -scale * normal.gradient, rtol=SOLVER_TOLERANCE, maxiter=SOLVER_STEPS)
+    return np.asarray(scale * step, np.float32)
 
 
 def normal_equations(

@@ -209,22 +209,21 @@ def side_seen(theta: Float32, rays: Float32, views: Sequence[InstantView]) -> Fl
     if ended.mean() < LEAST_SHARE:
         return np.zeros(len(theta), np.float32)
     way[~ended] = np.median(way[ended])
-    return np.float32(_share_of_way(theta, rays, views)) * way
+    same = max(same_side(float(np.median(theta)), rays, view) for view in views)
+    return np.float32(0.5 * (1.0 - same)) * way
 
 
-def _share_of_way(theta: Float32, rays: Float32, views: Sequence[InstantView]) -> float:
-    """In [0, 1/2], by the smallest angle at which a view that sees the middle of the points looks at it."""
-    middle = np.median(rays / np.exp(theta)[:, None], axis=0)
-    angles = []
-    for view in views:
-        inverse_depth = np.full(1, 1.0 / middle[2], np.float32)
-        if not np.isfinite(depth_beyond(np.log(inverse_depth), middle[None] / middle[2], view)[0]).all():
-            continue
-        line = middle - invert_pose(view.jTi)[:3, 3]
-        cosine = line @ middle / (np.linalg.norm(line) * np.linalg.norm(middle))
-        angles.append(float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+def same_side(log_inverse_depth: float, rays: Float32, view: InstantView) -> float:
+    """In [0, 1] how far a view sees the same side of a thing at that log inverse depth along ``rays (M, 3)``:
+    1 up to the smaller of ``SIDE_ANGLES_DEG``, 0 from the greater on."""
+    ray = np.median(rays, axis=0)
+    middle = ray / np.exp(log_inverse_depth)
+    line = middle - invert_pose(view.jTi)[:3, 3]
+    cosine = line @ middle / (np.linalg.norm(line) * np.linalg.norm(middle))
     low, high = SIDE_ANGLES_DEG
-    return 0.5 * float(np.clip((min(angles, default=0.0) - low) / (high - low), 0.0, 1.0))
+    return 1.0 - float(
+        np.clip((np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) - low) / (high - low), 0.0, 1.0)
+    )
 
 
 def support(

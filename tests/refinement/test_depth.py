@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares, minimize, minimize_scalar
+from scipy.sparse.linalg import spsolve
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import project, transform_points
@@ -199,6 +200,19 @@ def test_the_five_diagonals_are_the_explicit_system(seed: int) -> None:
     assert matrix[width - 1, width] == 0.0
     row, col = np.nonzero(matrix)
     assert set(np.abs(row - col)) == {0, 1, width}
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_step_solves_the_system(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one Gauss-Newton step, against a direct solve."""
+    given_ = problem(seed)
+    frame = given_.with_config(CONFIG)
+    normal = normal_equations(given_.theta, frame)
+    expected = spsolve(normal.matrix.tocsc().astype(np.float64), -normal.gradient.astype(np.float64))
+    assert np.abs(expected).max() < depth.LARGEST_STEP
+    monkeypatch.setattr(depth, "SOLVER_TOLERANCE", 1e-6)
+    solved, _ = solve_frame(given_.theta, frame, iterations=1)
+    np.testing.assert_allclose((solved - given_.theta).ravel(), expected, atol=1e-4 * np.abs(expected).max())
 
 
 def test_information_is_that_of_the_flow_alone() -> None:
