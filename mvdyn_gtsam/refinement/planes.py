@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.spatial.distance import cdist
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
+from mvdyn_gtsam.refinement.axes import bases, basis_of
 from mvdyn_gtsam.refinement.settings import PlainConfig
 
 Array = npt.NDArray[np.float64]
@@ -26,9 +27,12 @@ Mask = npt.NDArray[np.bool_]
 HYPOTHESES = 150
 """Planes through three points of a rim that are tried."""
 PLANES_PER_RIM = 3
-"""Different planes kept of one rim at most."""
+"""Planes kept of one rim at most. Where hardly any of it fits another they are the same again: that plane
+has all that the rim has to say."""
 RIM_POINTS = 300
 """Points of a rim looked at, drawn at random beyond."""
+SURFACE_POINTS = 1000
+"""Of a frame that its surfaces are found among."""
 LEAST_POINTS = 20
 """Of a rim that is believed."""
 LEAST_TRUST = 0.05
@@ -73,6 +77,7 @@ def plain_regions(
     trust: Float32,
     excluded: Mask,
     rays: Float32,
+    axes: Array,
     config: PlainConfig,
     seed: Sequence[int],
 ) -> list[PlainRegion]:
@@ -80,7 +85,7 @@ def plain_regions(
 
     ``theta (h, w)`` is log inverse depth, ``trust (h, w)`` how far it is believed, in [0, 1]; pixels of
     ``excluded (h, w)`` belong to no region; ``rays (h w, 3)`` has z = 1; ``seed`` makes the draw of points
-    repeatable.
+    repeatable. Planes may be any, upright on ``axes (K, 3)`` or parallel to what has these for normals.
     """
     random = np.random.default_rng(seed)
     found = []
@@ -95,7 +100,8 @@ def plain_regions(
             points = random.choice(points, RIM_POINTS, replace=False)
         rim_rays, weight = rays[points].astype(np.float64), trust.ravel()[points].astype(np.float64)
         inverse_depth = np.exp(theta.ravel()[points]).astype(np.float64)
-        planes, shares = _planes_of(rim_rays, inverse_depth, weight, config, random)
+        fitted = [_planes_of(rim_rays, inverse_depth, weight, config, random, basis) for basis in bases(axes)]
+        planes, shares = (np.concatenate(each) for each in zip(*fitted, strict=True))
         pixels = np.flatnonzero(cv2.dilate(region, np.ones((5, 5), np.uint8)).ravel())
         found.append(
             PlainRegion(
@@ -103,6 +109,23 @@ def plain_regions(
             )
         )
     return found
+
+
+def surfaces(
+    theta: Float32, trust: Float32, rays: Float32, config: PlainConfig, seed: Sequence[int]
+) -> Array:
+    """``(N, 4)``: planes ``q`` of the largest surfaces that are well seen, and their share of all that is;
+    arguments as of ``plain_regions``."""
+    seen = np.flatnonzero(trust.ravel() > WELL_SEEN)
+    if len(seen) < LEAST_POINTS:
+        return np.zeros((0, 4))
+    random = np.random.default_rng(seed)
+    points = random.choice(seen, min(len(seen), SURFACE_POINTS), replace=False)
+    inverse_depth = np.exp(theta.ravel()[points]).astype(np.float64)
+    found = _planes_of(
+        rays[points].astype(np.float64), inverse_depth, np.ones(len(points)), config, random, np.eye(3)
+    )
+    return np.column_stack(found)
 
 
 def planes_in_world(regions: Sequence[PlainRegion], wTc: Array) -> Array:
@@ -131,6 +154,7 @@ def fill_plain(
     regions: Sequence[PlainRegion],
     bank: Array,
     wTc: Array,
+    axes: Array,
     config: PlainConfig,
 ) -> Float32:
     """``theta (h, w)`` with agreed planes, as far as ``trust (h, w)`` leaves room and a plane is known.
@@ -147,7 +171,8 @@ def fill_plain(
             continue
         low, high = _range(region, config)
         filled = np.log(np.clip(region.rays @ agreed.plane, low, high)).astype(np.float32)
-        known = 1.0 / (1.0 + (_uncertainty(region, agreed, config) / HALF_KNOWN_SIGMA) ** 2)
+        basis = basis_of(agreed.plane, axes)
+        known = 1.0 / (1.0 + (_uncertainty(region, agreed, basis, config) / HALF_KNOWN_SIGMA) ** 2)
         share = ((1.0 - trust.ravel()[region.pixels]) * known).astype(np.float32)
         result.ravel()[region.pixels] += share * (filled - theta.ravel()[region.pixels])
     return result
@@ -165,7 +190,7 @@ class AgreedPlane:
 def agreed_plane(
     region: PlainRegion, planes: Array, weight: Array, frames: npt.NDArray[np.int64], config: PlainConfig
 ) -> AgreedPlane | None:
-    """Of ``planes (N, 3)`` that fit the region's rim the one that most others resemble.
+    """Of ``planes (N, 3)`` that fit the region's rim the one that most others resemble, the mean of these.
 
     ``frames (N,)`` says which come from one frame. None where too few frames, or less than half of the planes
     that fit, agree.
@@ -189,21 +214,25 @@ def agreed_plane(
     wanted = min(config.witnesses, -(-(int(frames.max()) + 1) // 2))
     if witnesses < wanted or alike[best].mean() < MAJORITY:
         return None
-    return AgreedPlane(np.asarray(planes[fits[best]]), witnesses)
+    members = fits[alike[best]]
+    agreed = np.average(planes[members], axis=0, weights=(weight * shares)[members])
+    return AgreedPlane(agreed, witnesses)
 
 
-def _uncertainty(region: PlainRegion, agreed: AgreedPlane, config: PlainConfig) -> Array:
+def _uncertainty(region: PlainRegion, agreed: AgreedPlane, basis: Array, config: PlainConfig) -> Array:
     """Standard deviation ``(M,)`` of the log depth of a region's pixels.
 
     From how the fitting points of its rim lie: far from them, or across a line on which they are, little is
-    known. The error of one frame's rim is common to its points; frames are independent.
+    known. The error of one frame's rim is common to its points; frames are independent. The plane is made of
+    the columns of ``basis (3, d)``.
     """
     error = np.abs(region.rim_rays @ agreed.plane / region.rim_inverse_depth - 1.0)
     fitting = error < 1.5 * config.tolerance
-    slope = region.rim_rays[fitting] / region.rim_inverse_depth[fitting, None]
+    slope = region.rim_rays[fitting] @ basis / region.rim_inverse_depth[fitting, None]
     weight = region.rim_trust[fitting] / region.rim_trust[fitting].sum()
     information = (slope * weight[:, None]).T @ slope * agreed.frames / config.tolerance**2
-    at_pixels = region.rays / np.maximum(region.rays @ agreed.plane, _range(region, config)[0])[:, None]
+    at_pixels = region.rays @ basis
+    at_pixels /= np.maximum(region.rays @ agreed.plane, _range(region, config)[0])[:, None]
     covariance = np.linalg.pinv(information, hermitian=True)
     return np.sqrt(np.einsum("ni,ij,nj->n", at_pixels, covariance, at_pixels))
 
@@ -222,25 +251,34 @@ def _without_contrast(grey: Float32, excluded: Mask, config: PlainConfig) -> lis
 
 
 def _planes_of(
-    rays: Array, inverse_depth: Array, trust: Array, config: PlainConfig, random: np.random.Generator
+    rays: Array,
+    inverse_depth: Array,
+    trust: Array,
+    config: PlainConfig,
+    random: np.random.Generator,
+    basis: Array,
 ) -> tuple[Array, Array]:
-    """The different planes ``(K, 3)`` that points fit, by RANSAC, and the share ``(K,)`` of each."""
-    drawn = random.choice(len(rays), (HYPOTHESES, 3), p=trust / trust.sum())
-    drawn = drawn[np.abs(np.linalg.det(rays[drawn])) > 1e-4]
+    """The planes ``(K, 3)`` that points fit, by RANSAC, and the share ``(K,)`` of each.
+
+    Only those made of the columns of ``basis (3, d)``, which as many points decide.
+    """
+    seen = rays @ basis
+    drawn = random.choice(len(rays), (HYPOTHESES, basis.shape[1]), p=trust / trust.sum())
+    drawn = drawn[np.abs(np.linalg.det(seen[drawn])) > 1e-4]
     planes: list[Array] = []
     if len(drawn) > 0:
-        hypotheses = np.linalg.solve(rays[drawn], inverse_depth[drawn][..., None])[..., 0]
+        hypotheses = np.linalg.solve(seen[drawn], inverse_depth[drawn][..., None])[..., 0] @ basis.T
         error = np.abs(hypotheses @ rays.T / inverse_depth - 1.0)
         score = np.maximum(1.0 - (error / config.tolerance) ** 2, 0.0)
         left = trust.copy()
         for _ in range(PLANES_PER_RIM):
             best = (score @ left).argmax()
-            plane = _fitted(hypotheses[best], rays, inverse_depth, trust, config)
+            plane = _fitted(hypotheses[best], rays, inverse_depth, trust, config, basis)
             if plane is None:
                 break
             fitting = np.abs(rays @ plane / inverse_depth - 1.0) < config.tolerance
             left[fitting] = 0.0
-            if _spread(rays[fitting]) >= config.spread:
+            if _spread(seen[fitting]) >= config.spread:
                 planes.append(plane)
     found = np.array(planes).reshape(-1, 3)
     shares = _share(found, rays, inverse_depth, trust, config)
@@ -249,7 +287,7 @@ def _planes_of(
 
 
 def _fitted(
-    plane: Array, rays: Array, inverse_depth: Array, trust: Array, config: PlainConfig
+    plane: Array, rays: Array, inverse_depth: Array, trust: Array, config: PlainConfig, basis: Array
 ) -> Array | None:
     """``plane`` after weighted least squares on the points that it fits; None with too few."""
     for _ in range(3):
@@ -257,8 +295,8 @@ def _fitted(
         if np.count_nonzero(fitting) < LEAST_POINTS // 2:
             return None
         root = np.sqrt(trust[fitting]) / inverse_depth[fitting]
-        scaled = rays[fitting] * root[:, None]
-        plane = np.asarray(np.linalg.lstsq(scaled, inverse_depth[fitting] * root, rcond=None)[0], np.float64)
+        scaled = rays[fitting] @ basis * root[:, None]
+        plane = basis @ np.linalg.lstsq(scaled, inverse_depth[fitting] * root, rcond=None)[0]
     return plane
 
 
@@ -268,10 +306,12 @@ def _share(planes: Array, rays: Array, inverse_depth: Array, trust: Array, confi
     return np.asarray(fitting @ trust / trust.sum())
 
 
-def _spread(rays: Array) -> float:
-    """How far points are from lying on one line of the image, in focal lengths."""
-    across = rays[:, :2] - rays[:, :2].mean(axis=0)
-    return float(np.sqrt(max(np.linalg.eigvalsh(across.T @ across / max(1, len(rays)))[0], 0.0)))
+def _spread(seen: Array) -> float:
+    """How far points, seen along ``(M, d)``, are from leaving a plane of ``d`` numbers undecided, in focal
+    lengths: of any plane how far from one line of the image."""
+    if seen.shape[1] == 3:
+        seen = seen[:, :2] - seen[:, :2].mean(axis=0)
+    return float(np.sqrt(max(np.linalg.eigvalsh(seen.T @ seen / max(1, len(seen)))[0], 0.0)))
 
 
 def _range(region: PlainRegion, config: PlainConfig) -> tuple[float, float]:

@@ -183,8 +183,9 @@ class RefinementConfig:
     moving_evidence: float = 0.2
     """How far the images of this or near instants must support a moving region's depth before it is believed.
     Source: choice."""
-    moving_sigma: float = 0.05
-    """Standard deviation of that depth, relative. Source: choice."""
+    moving_sigma: float = 0.1
+    """Standard deviation of that depth, relative. Source: 0.05 to 0.2 compared on three rendered scenes, all
+    within 2 %."""
     sweep: SweepConfig = field(default_factory=SweepConfig)
     plain: PlainConfig = field(default_factory=PlainConfig)
 

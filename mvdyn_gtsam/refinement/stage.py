@@ -20,6 +20,7 @@ import numpy.typing as npt
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, to_grey
 from mvdyn_gtsam.progress import Progress
+from mvdyn_gtsam.refinement.axes import main_axes
 from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_pairs
 from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context, smooth_colour
 from mvdyn_gtsam.refinement.growth import Growth
@@ -32,7 +33,7 @@ from mvdyn_gtsam.refinement.relief import RELIEF
 from mvdyn_gtsam.refinement.samples import FrameSample, SampleStore
 from mvdyn_gtsam.refinement.scale import solve_scales
 from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.tasks import FIRST_DEPTH, GUIDE_STEPS, PLANES, FinishedFrame, windows
+from mvdyn_gtsam.refinement.tasks import AXES, FIRST_DEPTH, GUIDE_STEPS, PLANES, FinishedFrame, windows
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 
@@ -290,6 +291,7 @@ class Refinement:
         source = self._depth
 
         def fill() -> None:
+            self._find_axes(source)
             planes = self._pool.map("planes", [(source, frame) for frame in self._frames])
             rows = [
                 np.insert(np.asarray(found), 0, np.array([frame]).T, axis=1)
@@ -301,6 +303,19 @@ class Refinement:
 
         self._step("plain regions", fill)
         self._depth = target
+
+    def _find_axes(self, source: str) -> None:
+        """The directions in which the scene of each group of cameras is built."""
+        found = self._pool.map("surfaces", [(source, frame) for frame in self._frames])
+        normals = [np.asarray(each).reshape(-1, 4) for each in found]
+        axes = [np.zeros((0, 4))]
+        for group in self._tracked.groups:
+            of_frame = [k for k, frame in enumerate(self._frames) if frame[0] in group]
+            rows = np.concatenate([normals[k] for k in of_frame])
+            frames = np.repeat(of_frame, [len(normals[k]) for k in of_frame])
+            found_axes = main_axes(rows[:, :3], rows[:, 3], frames)
+            axes.append(np.insert(found_axes, 0, group[0], axis=1))
+        self._workspace.write_array(AXES, np.concatenate(axes))
 
     def _solve_poses(self) -> None:
         """Phase 2, poses."""

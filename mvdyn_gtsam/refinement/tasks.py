@@ -36,7 +36,7 @@ from mvdyn_gtsam.refinement.motion import (
     settle_task,
 )
 from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
-from mvdyn_gtsam.refinement.planes import PlainRegion, fill_plain, plain_regions, planes_in_world
+from mvdyn_gtsam.refinement.planes import PlainRegion, fill_plain, plain_regions, planes_in_world, surfaces
 from mvdyn_gtsam.refinement.relief import relief_task
 from mvdyn_gtsam.refinement.samples import FrameSample
 
@@ -55,6 +55,9 @@ GUIDE_STEPS = 2
 FIRST_DEPTH = "depth 0"
 """The array of the first depth solve, from flow within cameras; it guides the flow between them."""
 
+AXES = "axes"
+"""The list ``(N, 4)`` of the directions of all scenes: the first camera of its group, and unit vectors in its
+world."""
 PLANES = "planes"
 """The list ``(N, 7)`` of all planes of plain regions: camera, time, and ``planes_in_world``."""
 
@@ -171,6 +174,17 @@ def _edges_of(
     ]
 
 
+def surfaces_task(context: Context, job: tuple[str, Frame]) -> Array:
+    """Unit normals in the world and shares ``(N, 4)`` of a frame's largest well seen surfaces: ``(read from,
+    frame)``."""
+    name, frame = job
+    trust = _still_trust(context, frame)
+    rays, config = context.workspace.views[frame[0]].rays, context.config.plain
+    found = surfaces(np.log(context.image(name, frame)), trust, rays, config, seed=frame)
+    normals = found[:, :3] / np.linalg.norm(found[:, :3], axis=1, keepdims=True)
+    return np.column_stack([normals @ context.poses()[frame][:3, :3].T, found[:, 3]])
+
+
 def planes_task(context: Context, job: tuple[str, Frame]) -> Array:
     """Planes ``(N, 5)`` in the world that the rims of a frame's plain regions fit: ``(read from, frame)``."""
     name, frame = job
@@ -192,6 +206,7 @@ def fill_task(context: Context, job: tuple[str, str, Frame]) -> None:
         found,
         bank[near],
         context.poses()[frame],
+        _axes_seen(context, frame),
         context.config.plain,
     )
     context.workspace.write(target, frame, np.exp(theta))
@@ -199,13 +214,26 @@ def fill_task(context: Context, job: tuple[str, str, Frame]) -> None:
 
 def _plain_regions(context: Context, name: str, frame: Frame) -> tuple[list[PlainRegion], Float32]:
     """Plain regions of a frame, and the trust ``(h, w)`` in its depth; nothing of what moves is trusted."""
-    workspace, view = context.workspace, context.workspace.views[frame[0]]
-    trust = context.trust(frame)
-    moves = (np.asarray(workspace.read("moving", frame)) != STATIC).astype(np.uint8)
-    trust[cv2.dilate(moves, np.ones((5, 5), np.uint8)) > 0] = 0.0
+    view, trust = context.workspace.views[frame[0]], _still_trust(context, frame)
+    moves = np.asarray(context.workspace.read("moving", frame)) != STATIC
     theta, grey = np.log(context.image(name, frame)), context.luminance(frame)
-    found = plain_regions(grey, theta, trust, moves > 0, view.rays, context.config.plain, seed=frame)
-    return found, trust
+    axes, config = _axes_seen(context, frame), context.config.plain
+    return plain_regions(grey, theta, trust, moves, view.rays, axes, config, seed=frame), trust
+
+
+def _still_trust(context: Context, frame: Frame) -> Float32:
+    """Trust ``(h, w)`` in a frame's depth, none in that of what moves and around it."""
+    trust = context.trust(frame)
+    moves = (np.asarray(context.workspace.read("moving", frame)) != STATIC).astype(np.uint8)
+    trust[cv2.dilate(moves, np.ones((5, 5), np.uint8)) > 0] = 0.0
+    return trust
+
+
+def _axes_seen(context: Context, frame: Frame) -> Array:
+    """Directions ``(K, 3)`` of the scene in the axes of a frame's camera."""
+    axes = context.workspace.read_array(AXES)
+    own = axes[np.isin(axes[:, 0], context.group_of(frame[0]))]
+    return np.asarray(own[:, 1:] @ context.poses()[frame][:3, :3])
 
 
 def sample_task(context: Context, job: tuple[str, Frame]) -> FrameSample:
@@ -349,6 +377,7 @@ TASKS = {
     "moving depth": moving_depth_task,
     "relief": relief_task,
     "window": window_task,
+    "surfaces": surfaces_task,
     "planes": planes_task,
     "plain regions": fill_task,
     "sample": sample_task,

@@ -18,6 +18,7 @@ from mvdyn_gtsam.refinement.planes import (
     plain_regions,
     planes_in_camera,
     planes_in_world,
+    surfaces,
 )
 from mvdyn_gtsam.refinement.settings import PlainConfig
 from tests.test_geometry import poses
@@ -35,6 +36,7 @@ CEILING = np.array([0.0, -1.0 / 1.2, 0.0])
 """1.2 m above the camera."""
 SIDE = np.array([1.0 / 1.8, 0.0, 0.0])
 """1.8 m to the right."""
+NO_AXES = np.zeros((0, 3))
 
 
 def room() -> tuple[Array, Array]:
@@ -54,10 +56,10 @@ def view_of_room() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return grey, theta, np.where(seen, 0.9, 0.0).astype(np.float32), truth
 
 
-def regions_of(seed: int = 0) -> list[PlainRegion]:
+def regions_of(seed: int = 0, axes: Array = NO_AXES) -> list[PlainRegion]:
     grey, theta, trust, _ = view_of_room()
     nothing = np.zeros(grey.shape, bool)
-    return plain_regions(grey, theta, trust, nothing, RAYS.astype(np.float32), CONFIG, (seed, 0))
+    return plain_regions(grey, theta, trust, nothing, RAYS.astype(np.float32), axes, CONFIG, (seed, 0))
 
 
 def bank_of(count: int) -> Array:
@@ -69,7 +71,7 @@ def bank_of(count: int) -> Array:
 def test_ceiling_takes_the_plane_through_both_walls_rims() -> None:
     grey, theta, trust, truth = view_of_room()
     bank = bank_of(8)
-    filled = fill_plain(theta, trust, regions_of(), bank, np.eye(4), CONFIG)
+    filled = fill_plain(theta, trust, regions_of(), bank, np.eye(4), NO_AXES, CONFIG)
     ceiling = room()[1] == 2
     before, after = np.abs(theta - truth)[ceiling], np.abs(filled - truth)[ceiling]
     assert before.mean() > 0.15
@@ -77,12 +79,59 @@ def test_ceiling_takes_the_plane_through_both_walls_rims() -> None:
     np.testing.assert_array_equal(filled[~ceiling & (ROW > 40)], theta[~ceiling & (ROW > 40)])
 
 
+def line_below_a_wall() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Image of a plain wall 4 m away over a textured floor, of which only the wall's foot is seen; depth that
+    is wrong on the wall, trust, truth."""
+    floor = np.array([0.0, 1.0 / 1.2, 0.0])
+    inverse_depth = np.stack([(RAYS @ plane).reshape(HEIGHT, WIDTH) for plane in (BACK, floor)])
+    random = np.random.default_rng(0)
+    wall = inverse_depth.argmax(axis=0) == 0
+    grey = np.where(wall, 200.0, 100.0 + 40.0 * random.random((HEIGHT, WIDTH))).astype(np.float32)
+    seen = ~np.roll(wall, -2, axis=0) | ~wall
+    truth = np.log(inverse_depth.max(axis=0))
+    theta = np.where(seen, truth, np.log(0.4)).astype(np.float32)
+    return grey, theta, np.where(seen, 0.9, 0.0).astype(np.float32), truth
+
+
+@pytest.mark.parametrize(("axes", "share"), [(NO_AXES, 1.0), (np.array([[0.0, 1.0, 0.0]]), 0.2)])
+def test_a_wall_of_which_only_the_foot_is_seen_stands_upright(axes: Array, share: float) -> None:
+    """Through one line there are many planes, but one alone is upright."""
+    grey, theta, trust, truth = line_below_a_wall()
+    rays, nothing = RAYS.astype(np.float32), np.zeros(grey.shape, bool)
+    found = [plain_regions(grey, theta, trust, nothing, rays, axes, CONFIG, (time, 0)) for time in range(8)]
+    rows = [
+        np.insert(planes_in_world(each, np.eye(4)), 0, [[0], [time]], axis=1)
+        for time, each in enumerate(found)
+    ]
+    filled = fill_plain(theta, trust, found[0], np.concatenate(rows), np.eye(4), axes, CONFIG)
+    above = ROW < 30
+    left = np.abs(filled - truth)[above].mean() / np.abs(theta - truth)[above].mean()
+    assert left <= share + 1e-6
+    assert (left < 0.9) == (share < 1.0)
+
+
+def test_surfaces_that_are_well_seen_are_found_by_their_planes() -> None:
+    truth, surface = room()
+    trust = np.where(surface == 2, 0.0, 0.9).astype(np.float32)
+    found = surfaces(truth.astype(np.float32), trust, RAYS.astype(np.float32), CONFIG, (0, 0))
+    assert len(found) > 0
+    np.testing.assert_allclose(found[0, :3], BACK, atol=0.02)
+    assert found[0, 3] == pytest.approx((surface == 0).sum() / (surface < 2).sum(), abs=0.1)
+    nowhere = np.zeros(truth.shape, np.float32)
+    assert surfaces(truth.astype(np.float32), nowhere, RAYS.astype(np.float32), CONFIG, (0, 0)).shape == (
+        0,
+        4,
+    )
+
+
 def test_nothing_is_filled_without_witnesses() -> None:
     _, theta, trust, _ = view_of_room()
     regions = regions_of()
     assert len(regions) > 0
     nobody = np.zeros((0, 7))
-    np.testing.assert_array_equal(fill_plain(theta, trust, regions, nobody, np.eye(4), CONFIG), theta)
+    np.testing.assert_array_equal(
+        fill_plain(theta, trust, regions, nobody, np.eye(4), NO_AXES, CONFIG), theta
+    )
 
 
 def test_a_plane_alone_against_many_is_not_taken() -> None:
@@ -121,7 +170,7 @@ def test_of_very_many_planes_some_are_compared() -> None:
 
 def test_a_plane_counts_less_far_from_its_rim() -> None:
     grey, theta, trust, truth = view_of_room()
-    filled = fill_plain(theta, trust, regions_of(), bank_of(2), np.eye(4), CONFIG)
+    filled = fill_plain(theta, trust, regions_of(), bank_of(2), np.eye(4), NO_AXES, CONFIG)
     ceiling = room()[1] == 2
     share = np.full(theta.shape, np.nan)
     share[ceiling] = (filled - theta)[ceiling] / (truth - theta)[ceiling]
@@ -132,7 +181,9 @@ def test_a_plane_counts_less_far_from_its_rim() -> None:
 def test_excluded_pixels_belong_to_no_region() -> None:
     grey, theta, trust, _ = view_of_room()
     everything = np.ones(grey.shape, bool)
-    assert plain_regions(grey, theta, trust, everything, RAYS.astype(np.float32), CONFIG, (0, 0)) == []
+    assert (
+        plain_regions(grey, theta, trust, everything, RAYS.astype(np.float32), NO_AXES, CONFIG, (0, 0)) == []
+    )
 
 
 def test_the_draw_is_repeatable() -> None:

@@ -65,7 +65,7 @@ def test_pixels_that_flow_does_not_find_keep_their_relief() -> None:
     there = LABELS.copy()
     there[-1, -1] = 1
     found = relief_over_time(
-        truth, LABELS, FlowTargets(np.array([2], np.int32), lost), [truth + 1.0], [there]
+        truth, LABELS, FlowTargets(np.array([2], np.int32), lost), [truth + np.float32(1.0)], [there]
     )
     np.testing.assert_array_equal(found, truth)
 
