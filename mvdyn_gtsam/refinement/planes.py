@@ -1,10 +1,10 @@
 """Depth of plain regions: the plane that their rims share over many frames.
 
 On a wall or ceiling without texture no flow says anything, but its rim is seen: where it meets other
-surfaces and where its texture begins. A plane is fitted to each rim. One frame's rim leaves several planes
-open (a ceiling that meets one wall may be that wall, too), so a region takes the plane on which the rims of
-all frames around agree best, as far as it fits its own rim. Piecewise planar stereo
-(https://doi.org/10.1109/ICCV.2009.5459417) has the idea that plain regions take planes found elsewhere.
+surfaces and where its texture begins. Planes are fitted to each rim, any and those that stand upright. One
+frame's rim leaves several open (a ceiling that meets one wall may be that wall, too), so a region takes the
+plane on which the rims of all frames around agree best, as far as it fits its own rim. Piecewise planar
+stereo (https://doi.org/10.1109/ICCV.2009.5459417) lets plain regions take planes found elsewhere.
 """
 
 from __future__ import annotations
@@ -52,8 +52,7 @@ HALF_KNOWN_SIGMA = 0.1
 
 @dataclass(frozen=True)
 class PlainRegion:
-    """A plain region and the planes ``q`` that its rim fits: ``q . ray`` is the inverse depth along a ray
-    with z = 1."""
+    """A plain region and what is seen of its rim."""
 
     pixels: npt.NDArray[np.int64]
     """``(M,)`` flat indices of the region, grown to the image's edge around it."""
@@ -65,10 +64,18 @@ class PlainRegion:
     """``(R,)``"""
     rim_trust: Array
     """``(R,)``"""
+
+
+@dataclass(frozen=True)
+class RimPlanes:
+    """The planes ``q`` that a region's rim fits: ``q . ray`` is the inverse depth along a ray with z = 1."""
+
     planes: Array
     """``(K, 3)``"""
     shares: Array
     """``(K,)`` of the rim's trust that each explains."""
+    size: int
+    """Pixels of the region."""
 
 
 def plain_regions(
@@ -77,7 +84,6 @@ def plain_regions(
     trust: Float32,
     excluded: Mask,
     rays: Float32,
-    axes: Array,
     config: PlainConfig,
     seed: Sequence[int],
 ) -> list[PlainRegion]:
@@ -85,7 +91,7 @@ def plain_regions(
 
     ``theta (h, w)`` is log inverse depth, ``trust (h, w)`` how far it is believed, in [0, 1]; pixels of
     ``excluded (h, w)`` belong to no region; ``rays (h w, 3)`` has z = 1; ``seed`` makes the draw of points
-    repeatable. Planes may be any, upright on ``axes (K, 3)`` or parallel to what has these for normals.
+    repeatable.
     """
     random = np.random.default_rng(seed)
     found = []
@@ -100,15 +106,19 @@ def plain_regions(
             points = random.choice(points, RIM_POINTS, replace=False)
         rim_rays, weight = rays[points].astype(np.float64), trust.ravel()[points].astype(np.float64)
         inverse_depth = np.exp(theta.ravel()[points]).astype(np.float64)
-        fitted = [_planes_of(rim_rays, inverse_depth, weight, config, random, basis) for basis in bases(axes)]
-        planes, shares = (np.concatenate(each) for each in zip(*fitted, strict=True))
         pixels = np.flatnonzero(cv2.dilate(region, np.ones((5, 5), np.uint8)).ravel())
-        found.append(
-            PlainRegion(
-                pixels, rays[pixels].astype(np.float64), rim_rays, inverse_depth, weight, planes, shares
-            )
-        )
+        found.append(PlainRegion(pixels, rays[pixels].astype(np.float64), rim_rays, inverse_depth, weight))
     return found
+
+
+def rim_planes(region: PlainRegion, axes: Array, config: PlainConfig, seed: Sequence[int]) -> RimPlanes:
+    """Planes that the rim of a region fits: any, those upright on ``axes (K, 3)``, and those with one of
+    these for a normal."""
+    random = np.random.default_rng(seed)
+    rim = (region.rim_rays, region.rim_inverse_depth, region.rim_trust)
+    fitted = [_planes_of(*rim, config, random, basis) for basis in bases(axes)]
+    planes, shares = (np.concatenate(each) for each in zip(*fitted, strict=True))
+    return RimPlanes(planes, shares, len(region.pixels))
 
 
 def surfaces(
@@ -128,15 +138,15 @@ def surfaces(
     return np.column_stack(found)
 
 
-def planes_in_world(regions: Sequence[PlainRegion], wTc: Array) -> Array:
-    """``(N, 5)``: unit normal and offset, ``n . p = d``, of every region's planes, and its say."""
+def planes_in_world(rims: Sequence[RimPlanes], wTc: Array) -> Array:
+    """``(N, 5)``: unit normal and offset, ``n . p = d``, of every rim's planes, and its say."""
     rows = []
-    for region in regions:
-        for plane, share in zip(region.planes, region.shares, strict=True):
+    for rim in rims:
+        for plane, share in zip(rim.planes, rim.shares, strict=True):
             normal = wTc[:3, :3] @ plane
             length = np.linalg.norm(normal)
             offset = (1.0 + normal @ wTc[:3, 3]) / length
-            rows.append([*(normal / length), offset, share * np.sqrt(len(region.pixels))])
+            rows.append([*(normal / length), offset, share * np.sqrt(rim.size)])
     return np.array(rows).reshape(-1, 5)
 
 

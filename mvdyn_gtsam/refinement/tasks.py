@@ -36,7 +36,14 @@ from mvdyn_gtsam.refinement.motion import (
     settle_task,
 )
 from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
-from mvdyn_gtsam.refinement.planes import PlainRegion, fill_plain, plain_regions, planes_in_world, surfaces
+from mvdyn_gtsam.refinement.planes import (
+    PlainRegion,
+    fill_plain,
+    plain_regions,
+    planes_in_world,
+    rim_planes,
+    surfaces,
+)
 from mvdyn_gtsam.refinement.relief import relief_task
 from mvdyn_gtsam.refinement.samples import FrameSample
 
@@ -189,7 +196,9 @@ def planes_task(context: Context, job: tuple[str, Frame]) -> Array:
     """Planes ``(N, 5)`` in the world that the rims of a frame's plain regions fit: ``(read from, frame)``."""
     name, frame = job
     found, _ = _plain_regions(context, name, frame)
-    return planes_in_world(found, context.poses()[frame])
+    axes, config = _axes_seen(context, frame), context.config.plain
+    rims = [rim_planes(region, axes, config, seed=(*frame, number)) for number, region in enumerate(found)]
+    return planes_in_world(rims, context.poses()[frame])
 
 
 def fill_task(context: Context, job: tuple[str, str, Frame]) -> None:
@@ -217,8 +226,7 @@ def _plain_regions(context: Context, name: str, frame: Frame) -> tuple[list[Plai
     view, trust = context.workspace.views[frame[0]], _still_trust(context, frame)
     moves = np.asarray(context.workspace.read("moving", frame)) != STATIC
     theta, grey = np.log(context.image(name, frame)), context.luminance(frame)
-    axes, config = _axes_seen(context, frame), context.config.plain
-    return plain_regions(grey, theta, trust, moves, view.rays, axes, config, seed=frame), trust
+    return plain_regions(grey, theta, trust, moves, view.rays, context.config.plain, seed=frame), trust
 
 
 def _still_trust(context: Context, frame: Frame) -> Float32:

@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 
 from mvdyn_gtsam.refinement.planes import (
     PlainRegion,
+    RimPlanes,
     agreed_plane,
     fill_plain,
     plain_regions,
     planes_in_camera,
     planes_in_world,
+    rim_planes,
     surfaces,
 )
 from mvdyn_gtsam.refinement.settings import PlainConfig
@@ -56,22 +58,29 @@ def view_of_room() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return grey, theta, np.where(seen, 0.9, 0.0).astype(np.float32), truth
 
 
-def regions_of(seed: int = 0, axes: Array = NO_AXES) -> list[PlainRegion]:
+def regions_of(seed: int = 0) -> list[PlainRegion]:
     grey, theta, trust, _ = view_of_room()
     nothing = np.zeros(grey.shape, bool)
-    return plain_regions(grey, theta, trust, nothing, RAYS.astype(np.float32), axes, CONFIG, (seed, 0))
+    return plain_regions(grey, theta, trust, nothing, RAYS.astype(np.float32), CONFIG, (seed, 0))
 
 
 def bank_of(count: int) -> Array:
     """Planes of ``count`` frames of a camera that stands still."""
-    rows = [(time, planes_in_world(regions_of(time), np.eye(4))) for time in range(count)]
-    return np.concatenate([np.insert(found, 0, [[0], [time]], axis=1) for time, found in rows])
+    return bank([regions_of(time) for time in range(count)], NO_AXES)
+
+
+def bank(found: list[list[PlainRegion]], axes: Array) -> Array:
+    """Planes of the regions ``found`` in the frames of a camera that stands still."""
+    rows = []
+    for time, regions in enumerate(found):
+        rims = [rim_planes(region, axes, CONFIG, (time, number)) for number, region in enumerate(regions)]
+        rows.append(np.insert(planes_in_world(rims, np.eye(4)), 0, [[0], [time]], axis=1))
+    return np.concatenate(rows)
 
 
 def test_ceiling_takes_the_plane_through_both_walls_rims() -> None:
     grey, theta, trust, truth = view_of_room()
-    bank = bank_of(8)
-    filled = fill_plain(theta, trust, regions_of(), bank, np.eye(4), NO_AXES, CONFIG)
+    filled = fill_plain(theta, trust, regions_of(), bank_of(8), np.eye(4), NO_AXES, CONFIG)
     ceiling = room()[1] == 2
     before, after = np.abs(theta - truth)[ceiling], np.abs(filled - truth)[ceiling]
     assert before.mean() > 0.15
@@ -98,12 +107,8 @@ def test_a_wall_of_which_only_the_foot_is_seen_stands_upright(axes: Array, share
     """Through one line there are many planes, but one alone is upright."""
     grey, theta, trust, truth = line_below_a_wall()
     rays, nothing = RAYS.astype(np.float32), np.zeros(grey.shape, bool)
-    found = [plain_regions(grey, theta, trust, nothing, rays, axes, CONFIG, (time, 0)) for time in range(8)]
-    rows = [
-        np.insert(planes_in_world(each, np.eye(4)), 0, [[0], [time]], axis=1)
-        for time, each in enumerate(found)
-    ]
-    filled = fill_plain(theta, trust, found[0], np.concatenate(rows), np.eye(4), axes, CONFIG)
+    found = [plain_regions(grey, theta, trust, nothing, rays, CONFIG, (time, 0)) for time in range(8)]
+    filled = fill_plain(theta, trust, found[0], bank(found, axes), np.eye(4), axes, CONFIG)
     above = ROW < 30
     left = np.abs(filled - truth)[above].mean() / np.abs(theta - truth)[above].mean()
     assert left <= share + 1e-6
@@ -181,21 +186,20 @@ def test_a_plane_counts_less_far_from_its_rim() -> None:
 def test_excluded_pixels_belong_to_no_region() -> None:
     grey, theta, trust, _ = view_of_room()
     everything = np.ones(grey.shape, bool)
-    assert (
-        plain_regions(grey, theta, trust, everything, RAYS.astype(np.float32), NO_AXES, CONFIG, (0, 0)) == []
-    )
+    assert plain_regions(grey, theta, trust, everything, RAYS.astype(np.float32), CONFIG, (0, 0)) == []
 
 
 def test_the_draw_is_repeatable() -> None:
     first, second = regions_of(3), regions_of(3)
     for one, other in zip(first, second, strict=True):
-        np.testing.assert_array_equal(one.planes, other.planes)
+        np.testing.assert_array_equal(one.rim_rays, other.rim_rays)
+        rims = [rim_planes(region, NO_AXES, CONFIG, (3, 0)) for region in (one, other)]
+        np.testing.assert_array_equal(rims[0].planes, rims[1].planes)
 
 
 @given(poses(), st.floats(0.1, 10.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
 def test_planes_return_from_the_world(wTc: Array, z: float, x: float, y: float) -> None:
     plane = np.array([x, y, 1.0]) / z
-    region = PlainRegion(np.arange(4), RAYS[:4], RAYS[:4], np.ones(4), np.ones(4), plane[None], np.ones(1))
-    world = planes_in_world([region], wTc)
+    world = planes_in_world([RimPlanes(plane[None], np.ones(1), 4)], wTc)
     assert np.linalg.norm(world[0, :3]) == pytest.approx(1.0)
     np.testing.assert_allclose(planes_in_camera(world[:, :4], wTc)[0], plane, rtol=1e-5, atol=1e-6)
