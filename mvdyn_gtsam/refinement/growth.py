@@ -57,7 +57,7 @@ class Growth:
 
 
 def is_one_thing(shared: int, size: int, size_there: int) -> bool:
-    """Whether two regions that share so many pixels are."""
+    """Whether two regions are one thing, by the pixels they share and their own."""
     return bool(shared >= ONE_THING * max(size, size_there))
 
 

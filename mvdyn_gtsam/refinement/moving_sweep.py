@@ -62,8 +62,8 @@ def swept_region(
     best = np.zeros((len(tried), len(own)), np.float32)
     for view in views:
         alike = patch_likeness(crop, shifted, _sweep_view(view), np.exp(tried), SWEEP)[:, inside]
-        angle = same_side(log_inverse_depth, own, view)
-        np.maximum(best, np.float32(LEAST_SAY + (1.0 - LEAST_SAY) * angle) * alike, out=best)
+        say = LEAST_SAY + (1.0 - LEAST_SAY) * same_side(log_inverse_depth, own, view)
+        np.maximum(best, np.float32(say) * alike, out=best)
     cost = PRIOR * np.minimum(np.abs(tried - tried[STEPS]) / PRIOR_REACH, 1.0)[:, None] - SAY * best
     for each, theta in zip(cost, tried, strict=True):
         each += DENIED * contradicted(np.full(len(own), theta, np.float32), own, views)
