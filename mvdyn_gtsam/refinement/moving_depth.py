@@ -215,7 +215,8 @@ def side_seen(theta: Float32, rays: Float32, views: Sequence[InstantView]) -> Fl
 
 def same_side(log_inverse_depth: float, rays: Float32, view: InstantView) -> float:
     """In [0, 1] how far a view sees the same side of a thing at that log inverse depth along ``rays (M, 3)``:
-    1 up to the smaller of ``SIDE_ANGLES_DEG``, 0 from the greater on."""
+    1 up to the smaller of ``SIDE_ANGLES_DEG``, 0 from the greater on; by the angle alone, whether or not the
+    thing lies in its image."""
     ray = np.median(rays, axis=0)
     middle = ray / np.exp(log_inverse_depth)
     line = middle - invert_pose(view.jTi)[:3, 3]

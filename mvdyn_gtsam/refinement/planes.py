@@ -32,7 +32,7 @@ has all that the rim has to say."""
 RIM_POINTS = 300
 """Points of a rim looked at, drawn at random beyond."""
 SURFACE_POINTS = 1000
-"""Of a frame that its surfaces are found among."""
+"""Of a frame that its surfaces are found among. Source: choice."""
 LEAST_POINTS = 20
 """Of a rim that is believed."""
 LEAST_TRUST = 0.05
