@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from queue import Empty, Queue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from mvdyn_gtsam.batch.clips import BatchError, Clip
 from mvdyn_gtsam.batch.job import ClipKilledError, one_line
@@ -32,6 +32,8 @@ _IGNORE_INTERRUPT = "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)
 """Ctrl-C reaches every process of the terminal; the one that runs the batch ends the others in order."""
 
 logger = logging.getLogger(__name__)
+
+Started = TypeVar("Started")
 
 
 def require_dask() -> None:
@@ -54,6 +56,23 @@ def _quiet() -> Iterator[None]:
         dask_logger.setLevel(level)
 
 
+def _begun(begin: Callable[[], Started]) -> Started:
+    """What ``begin`` returns, at the second try if need be.
+
+    Dask gives a thread of its own ten seconds to start and asserts that it did (``LoopRunner`` of
+    distributed/utils.py); a machine that is busy or was asleep misses that. Raises BatchError when it does
+    twice.
+    """
+    with suppress(AssertionError):
+        return begin()
+    try:
+        return begin()
+    except AssertionError as error:
+        raise BatchError(
+            "Dask twice could not start a thread within ten seconds: the machine is too busy; try again later"
+        ) from error
+
+
 @contextmanager
 def local_cluster(workers: int, retries: int) -> Iterator[Client]:
     """Processes on this machine; one that dies is replaced, and its clip run again ``retries`` times."""
@@ -63,16 +82,18 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
     with (
         _quiet(),
         dask.config.set({"distributed.scheduler.allowed-failures": retries}),
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            # What needs memory is not the worker but its child.
-            memory_limit=0,
-            # Any free port: 8787 may be taken, which would be warned of.
-            dashboard_address=":0",
-            silence_logs=logging.CRITICAL,
-            preload=_IGNORE_INTERRUPT,
+        _begun(
+            lambda: LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                # What needs memory is not the worker but its child.
+                memory_limit=0,
+                # Any free port: 8787 may be taken, which would be warned of.
+                dashboard_address=":0",
+                silence_logs=logging.CRITICAL,
+                preload=_IGNORE_INTERRUPT,
+            )
         ) as cluster,
         Client(cluster) as client,
     ):
@@ -87,7 +108,7 @@ def remote_cluster(address: str) -> Iterator[Client]:
     with ExitStack() as stack:
         stack.enter_context(_quiet())
         try:
-            client = stack.enter_context(Client(address, timeout=CONNECT_S))
+            client = stack.enter_context(_begun(lambda: Client(address, timeout=CONNECT_S)))
         except (OSError, ValueError) as error:
             raise BatchError(
                 f"{address}: no Dask scheduler answers there; start one: dask scheduler"

@@ -235,6 +235,34 @@ def test_a_scheduler_that_is_not_there_is_one_line(tmp_path: Path, monkeypatch: 
             pass
 
 
+@pytest.mark.parametrize("misses", [1, 2])
+def test_a_machine_too_busy_to_start_dask_in_time_is_asked_twice(
+    misses: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from distributed import LocalCluster
+    from distributed.utils import LoopRunner
+
+    start, tries = LoopRunner._start_unlocked, []
+
+    def late(runner: LoopRunner) -> None:
+        tries.append(runner)
+        assert len(tries) > misses
+        start(runner)
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+        monkeypatch.setattr(LoopRunner, "_start_unlocked", late)
+        if misses == 2:
+            with (
+                pytest.raises(BatchError, match="too busy; try again"),
+                remote_cluster(cluster.scheduler_address),
+            ):
+                pass
+        else:
+            with remote_cluster(cluster.scheduler_address) as client:
+                assert client.submit(len, "ab").result() == 2
+    assert len(tries) == 2
+
+
 @pytest.mark.slow  # the client tries for half a minute to reach it again
 def test_the_loss_of_the_scheduler_is_said(tmp_path: Path) -> None:
     from distributed import LocalCluster
