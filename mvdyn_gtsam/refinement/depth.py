@@ -16,11 +16,11 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.sparse.linalg import cg
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.edges import Edge
+from mvdyn_gtsam.refinement.lattice import lattice_solution, lattice_system
 from mvdyn_gtsam.refinement.residuals import FlowTerms, confidence, ratio_terms, reweighted
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 
@@ -110,27 +110,10 @@ def solve_frame(
         # depth edges are found coarse to fine: a wide kernel first
         widening = min(WIDEST_KERNEL, 2.0 ** max(0, iterations - 2 - iteration))
         normal = normal_equations(theta, problem, widening)
-        step = _solved(normal)
+        step = lattice_solution(normal.matrix, -normal.gradient, SOLVER_TOLERANCE, SOLVER_STEPS)
         theta = theta + np.clip(step, -LARGEST_STEP, LARGEST_STEP).reshape(theta.shape).astype(np.float32)
         information = normal.information.reshape(theta.shape)
     return theta, information
-
-
-def _solved(normal: Normal) -> Float32:
-    """The Gauss-Newton step ``(N,)``.
-
-    The diagonal as preconditioner is put into the system, ``(S A S) (S^-1 x) = S b`` with ``S`` the inverse
-    root of the diagonal: applied in every iteration it took a tenth of the solve or more.
-    """
-    offsets, bands = normal.matrix.offsets, normal.matrix.data
-    scale = 1.0 / np.sqrt(normal.matrix.diagonal())
-    # entry k of the diagonal with offset d belongs to column k and row k - d; beyond the ends bands are zero
-    scaled = np.stack(
-        [band * scale * np.roll(scale, offset) for band, offset in zip(bands, offsets, strict=True)]
-    )
-    matrix = sparse.dia_array((scaled, offsets), normal.matrix.shape)
-    step, _ = cg(matrix, -scale * normal.gradient, rtol=SOLVER_TOLERANCE, maxiter=SOLVER_STEPS)
-    return np.asarray(scale * step, np.float32)
 
 
 def normal_equations(
@@ -150,18 +133,8 @@ def normal_equations(
             _add_ratio(agreement, gradient, edge, rho, terms, there, config)
     diagonal = information + agreement + prior.weight.ravel()
     gradient += (prior.weight * (theta - prior.theta)).ravel()
-    across, down, smooth_diagonal, smooth_gradient = _smoothness(
-        theta, problem.image_weights, config, widening
-    )
-    width = theta.shape[1]
-    # dia_array: entry k of the diagonal with offset d belongs to column k
-    bands = np.zeros((5, theta.size), np.float32)
-    bands[0] = diagonal + smooth_diagonal.ravel()
-    bands[1, 1:] = -across.ravel()[:-1]
-    bands[2, :-1] = -across.ravel()[:-1]
-    bands[3, width:] = -down.ravel()[:-width]
-    bands[4, :-width] = -down.ravel()[:-width]
-    matrix = sparse.dia_array((bands, [0, 1, -1, width, -width]), (theta.size, theta.size))
+    across, down, smooth_gradient = _smoothness(theta, problem.image_weights, config, widening)
+    matrix = lattice_system(diagonal.reshape(theta.shape), across, down)
     return Normal(matrix, gradient + smooth_gradient.ravel(), information)
 
 
@@ -256,16 +229,13 @@ def _smoothness(
     image_weights: tuple[Float32, Float32],
     config: RefinementConfig,
     widening: float,
-) -> tuple[Float32, Float32, Float32, Float32]:
-    """Weights ``(h, w)`` to the right and lower neighbours, and their share of the diagonal and gradient."""
+) -> tuple[Float32, Float32, Float32]:
+    """Weights ``(h, w)`` to the right and lower neighbours, and their share of the gradient."""
     scale = np.float32(config.smoothness_scale * widening)
     across, down = (np.float32(config.smoothness / config.smoothness_scale**2) * w for w in image_weights)
     right, below = np.diff(theta, axis=1), np.diff(theta, axis=0)
     across[:, :-1] /= 1.0 + (right / scale) ** 2
     down[:-1] /= 1.0 + (below / scale) ** 2
-    diagonal = across + down
-    diagonal[:, 1:] += across[:, :-1]
-    diagonal[1:] += down[:-1]
     gradient = np.zeros_like(theta)
     pull = across[:, :-1] * right
     gradient[:, :-1] -= pull
@@ -273,4 +243,4 @@ def _smoothness(
     pull = down[:-1] * below
     gradient[:-1] -= pull
     gradient[1:] += pull
-    return across, down, diagonal, gradient
+    return across, down, gradient

@@ -136,7 +136,8 @@ def test_unknown_background_leaves_the_mask() -> None:
     mask[10:30, 20:35] = True
     unknown = np.full((*SHAPE, 3), np.nan, np.float32)
     found = outlined(mask, grown(mask, CONFIG.moving_reach), coloured(WALL), unknown, CONFIG)
-    assert np.count_nonzero(found ^ mask) < 0.05 * np.count_nonzero(mask)
+    # no edge of the image holds it: corners are rounded, and it grows by a pixel at most
+    assert found[13:27, 23:32].all() and not (found & ~grown(mask, 1.0 / mask.shape[1])).any()
 
 
 def test_grown_reaches_as_far_as_the_setting() -> None:
@@ -145,15 +146,31 @@ def test_grown_reaches_as_far_as_the_setting() -> None:
     assert np.count_nonzero(grown(mask, CONFIG.moving_reach)) == (2 * 6 + 1) ** 2
 
 
-def test_a_gap_that_looks_like_the_background_is_closed_where_it_moves() -> None:
+def test_a_gap_is_closed_where_the_image_has_no_outline_of_it() -> None:
     shape = (80, 256)
     thing = np.zeros(shape, bool)
     thing[20:60, 100:160] = True
-    wall = np.full(shape, 100.0, np.float32)
-    grey = np.where(thing, 40.0, wall).astype(np.float32)
-    grey[30:50, 124:136] = 100.0
+    grey = np.where(thing, 40.0, 100.0).astype(np.float32)
     around = grown(thing, CONFIG.moving_reach)
-    assert outlined(thing, around, coloured(grey), coloured(wall), CONFIG)[32:48, 126:134].all()
-    beside = thing.copy()
-    beside[25:55, 119:141] = False
-    assert not outlined(beside, around, coloured(grey), coloured(wall), CONFIG)[34:46, 128:132].any()
+    # what stands behind its middle is as dark as itself
+    dark = np.full(shape, 100.0, np.float32)
+    dark[36:44, 126:134] = 40.0
+    assert outlined(thing, around, coloured(grey), coloured(dark), CONFIG)[34:46, 124:136].all()
+    # through a gap, the wall
+    wall, through = np.full(shape, 100.0, np.float32), grey.copy()
+    through[30:50, 124:136] = 100.0
+    found = outlined(thing, around, coloured(through), coloured(wall), CONFIG)
+    assert not found[32:48, 126:134].any() and found[32:48, 104:120].all()
+
+
+def test_an_outline_lies_where_half_a_pixel_is_hidden_however_strong_the_contrast() -> None:
+    true = np.zeros(SHAPE, bool)
+    true[10:30, 20:35] = True
+    fat = grown(true, CONFIG.moving_reach)
+    for contrast in (30.0, 60.0, 90.0):
+        # pixels beside it are hidden by a seventh, which at the stronger contrast is above the limit
+        share = np.where(grown(true, 1.0 / true.shape[1]), 0.15, 0.0)
+        share[true] = 1.0
+        grey = (WALL - contrast * share).astype(np.float32)
+        found = outlined(fat, grown(fat, CONFIG.moving_reach), coloured(grey), coloured(WALL), CONFIG)
+        assert np.count_nonzero(found & ~true) <= 4 and np.count_nonzero(true & ~found) <= 8
