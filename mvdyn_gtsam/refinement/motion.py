@@ -157,19 +157,21 @@ def settle_task(context: Context, frame: Frame) -> None:
     """What moves in a frame, by the vote of the frames around it, and the depth of what stands still."""
     workspace, config = context.workspace, context.config
     labels, around = _what_moves(context, frame)
-    trust = context.trust(frame)
+    trust, behind = context.trust(frame), np.zeros(labels.shape, bool)
     trust[around] = 0.0
     if trust.max() > LEAST_TRUST:
         theta = _without_leaks(context.image("first", frame), trust, around)
         if (labels > 0).any():
-            labels, theta = _outlined(context, frame, labels > 0, around, theta)
+            labels, theta, behind = _outlined(context, frame, labels > 0, around, theta)
     else:
         # a camera that stands still has no parallax of its own: the others' flow will tell
         theta = np.log(context.image("aligned", frame))
     weight = np.maximum(trust, 1e-3) / np.float32(config.prior_sigma**2)
     held = (np.asarray(workspace.read("held", frame)) > 0) & ~around
+    for known, sigma in ((held, config.held_sigma), (behind, config.behind_sigma)):
+        weight = np.where(known, np.maximum(weight, np.float32(sigma**-2)), weight)
     workspace.write("prior", frame, theta)
-    workspace.write("prior_weight", frame, np.where(held, np.maximum(weight, config.held_sigma**-2), weight))
+    workspace.write("prior_weight", frame, weight)
     workspace.write(LABELS, frame, labels.astype(np.uint8))
 
 
@@ -302,16 +304,16 @@ def _other_times(context: Context, frame: Frame) -> list[OtherTime]:
 
 def _outlined(
     context: Context, frame: Frame, moves: Mask, around: Mask, theta: Float32
-) -> tuple[Labels, Float32]:
+) -> tuple[Labels, Float32, Mask]:
     """Label ``(h, w)`` of the regions that move, with outlines found against what other times see behind
-    them, and ``theta (h, w)`` of the background with the depth at which they see it."""
+    them, ``theta (h, w)`` of the background with the depth at which they see it, and where they do."""
     view, others = context.workspace.views[frame[0]], _other_times(context, frame)
     known = depth_behind(around, view.rays, view.intrinsics, others)
     theta = np.where(np.isfinite(known), known, theta)
     pixels = np.flatnonzero(around)
-    behind = np.full((*moves.shape, 3), np.nan, np.float32)
-    behind.reshape(-1, 3)[pixels] = background(
+    colour = np.full((*moves.shape, 3), np.nan, np.float32)
+    colour.reshape(-1, 3)[pixels] = background(
         np.exp(theta.ravel()[pixels]), view.rays[pixels], view.intrinsics, others
     )
-    found = outlined(moves, around, context.colour(frame), behind, context.config)
-    return regions(found.astype(np.uint8), context.config), theta
+    found = outlined(moves, around, context.colour(frame), colour, context.config)
+    return regions(found.astype(np.uint8), context.config), theta, np.isfinite(known)

@@ -209,8 +209,16 @@ def side_seen(theta: Float32, rays: Float32, views: Sequence[InstantView]) -> Fl
     if ended.mean() < LEAST_SHARE:
         return np.zeros(len(theta), np.float32)
     way[~ended] = np.median(way[ended])
-    same = max(same_side(float(np.median(theta)), rays, view) for view in views)
-    return np.float32(0.5 * (1.0 - same)) * way
+    middle = float(np.median(theta))
+    same = [same_side(middle, rays, view) for view in views if _sees_middle(middle, rays, view)]
+    return np.float32(0.5 * (1.0 - max(same, default=1.0))) * way
+
+
+def _sees_middle(log_inverse_depth: float, rays: Float32, view: InstantView) -> bool:
+    """Whether the middle of a thing at that log inverse depth along ``rays (M, 3)`` lies in the image of a
+    view."""
+    ray = np.median(rays, axis=0)[None].astype(np.float32)
+    return bool(np.isfinite(depth_beyond(np.full(1, log_inverse_depth, np.float32), ray, view)[0]).all())
 
 
 def same_side(log_inverse_depth: float, rays: Float32, view: InstantView) -> float:

@@ -8,9 +8,9 @@ import numpy as np
 
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
-from mvdyn_gtsam.refinement.context import Context
+from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context
 from mvdyn_gtsam.refinement.edges import flow_targets
-from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, carry_task, kept_far_off
+from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, carry_task, kept_far_off, settle_task
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
@@ -58,3 +58,34 @@ def test_what_is_too_fast_for_flow_is_carried_from_the_next_frames(tmp_path: Pat
     # a depth that flow settles stands, whatever the neighbours see
     workspace.write("information", (0, 0), np.full(view.shape, 1e6, np.float32))
     assert not carried(0).any()
+
+
+def test_what_other_times_see_behind_a_thing_holds_the_depth_beside_it(tmp_path: Path) -> None:
+    # one camera that stands still before a wall 2 m away; in the middle frame a block, and flow that calls
+    # more than the block moving and settles nothing around
+    view, middle = DenseView.of(Camera("cam0", 64, 48, 60.0, 60.0, 31.5, 23.5), 1.0), (0, 12)
+    workspace, config = Workspace(tmp_path, (view,), 25), RefinementConfig(stride=1)
+    workspace.prepare("test")
+    for name in ("first", "information", "prior", "prior_weight"):
+        workspace.create(name)
+    for name in ("fails", "held", LABELS):
+        workspace.create(name, np.uint8)
+    workspace.create(COLOUR, np.uint8, channels=(3,))
+    block, fat = np.zeros(view.shape, bool), np.zeros(view.shape, bool)
+    block[14:34, 24:40], fat[12:36, 22:42] = True, True
+    for time in range(25):
+        here = block & (time == middle[1])
+        workspace.write("first", (0, time), np.full(view.shape, -np.log(2.0), np.float32))
+        workspace.write("information", (0, time), np.full(view.shape, 1e6, np.float32))
+        workspace.write(COLOUR, (0, time), np.dstack([np.where(here, 200, 100), *[0 * here + 128] * 2]))
+    workspace.write("fails", middle, fat)
+    workspace.write_array("poses", np.tile(np.eye(4), (1, 25, 1, 1)))
+    context = Context(workspace, ((0,),), {}, config, DisFlow(), FlowConfig())
+    context.keep_flow_targets(middle, flow_targets([], block.size))
+
+    settle_task(context, middle)
+    found = np.asarray(workspace.read(LABELS, middle)) > 0
+    assert np.count_nonzero(found ^ block) <= 12
+    beside = fat & ~found
+    np.testing.assert_allclose(context.image("prior", middle)[beside], -np.log(2.0), atol=1e-3)
+    np.testing.assert_allclose(context.image("prior_weight", middle)[beside], config.behind_sigma**-2)

@@ -192,6 +192,19 @@ def test_what_is_seen_from_about_the_same_side_is_where_it_is_matched() -> None:
     assert 0.0 < way_to_the_front(45.0).mean()
 
 
+def test_a_view_that_looks_away_has_no_say_in_how_far_it_comes_forward() -> None:
+    """At our place it would see the same side of the thing, but it looks at something else."""
+    middle = np.zeros(SHAPE, bool)
+    middle[25:35, 38:42] = True
+    theta, rays = np.full(int(middle.sum()), np.log(0.5), np.float32), RAYS[middle.ravel()]
+    aside = from_the_side(90.0, 0.3)
+    away = replace(aside, jTi=aside.jTi.copy())
+    away.jTi[:3, 3] = 0.0
+    way = side_seen(theta, rays, [aside])
+    assert way.mean() > 0.05
+    np.testing.assert_array_equal(side_seen(theta, rays, [aside, away]), way)
+
+
 def test_a_hull_that_no_view_ends_says_nothing() -> None:
     """The other camera sees nothing but what moves, or not the front of it."""
     assert (way_to_the_front(90.0, radius=5.0) == 0.0).all()
