@@ -79,7 +79,7 @@ class RimPlanes:
 
 
 def plain_regions(
-    grey: Float32,
+    colour: Float32,
     theta: Float32,
     trust: Float32,
     excluded: Mask,
@@ -87,7 +87,7 @@ def plain_regions(
     config: PlainConfig,
     seed: Sequence[int],
 ) -> list[PlainRegion]:
-    """Regions of the image ``grey (h, w)`` without contrast whose depth is little trusted.
+    """Regions of the image ``colour (h, w, 3)`` without contrast whose depth is little trusted.
 
     ``theta (h, w)`` is log inverse depth, ``trust (h, w)`` how far it is believed, in [0, 1]; pixels of
     ``excluded (h, w)`` belong to no region; ``rays (h w, 3)`` has z = 1; ``seed`` makes the draw of points
@@ -95,7 +95,7 @@ def plain_regions(
     """
     random = np.random.default_rng(seed)
     found = []
-    for region in _without_contrast(grey, excluded, config):
+    for region in _without_contrast(colour, excluded, config):
         if trust[region > 0].mean() > WELL_SEEN:
             continue
         rim = cv2.dilate(region, np.ones((2 * config.rim + 1,) * 2, np.uint8)) > 0
@@ -247,13 +247,15 @@ def _uncertainty(region: PlainRegion, agreed: AgreedPlane, basis: Array, config:
     return np.sqrt(np.einsum("ni,ij,nj->n", at_pixels, covariance, at_pixels))
 
 
-def _without_contrast(grey: Float32, excluded: Mask, config: PlainConfig) -> list[npt.NDArray[np.uint8]]:
-    """``(h, w)`` each, 1 in one connected region without contrast."""
-    slope = np.hypot(*(cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, scale=0.125) for dx in (1, 0)))
+def _without_contrast(colour: Float32, excluded: Mask, config: PlainConfig) -> list[npt.NDArray[np.uint8]]:
+    """``(h, w)`` each, 1 in one connected region without contrast: walls as bright as each other are told
+    apart by their hue."""
+    squares = [cv2.Sobel(colour, cv2.CV_32F, dx, 1 - dx, scale=0.125) ** 2 for dx in (1, 0)]
+    slope = np.sqrt((squares[0] + squares[1]).sum(axis=2))
     plain = cv2.erode((slope < config.contrast).astype(np.uint8), np.ones((3, 3), np.uint8))
     plain[excluded] = 0
     count, labels, stats, _ = cv2.connectedComponentsWithStats(plain, connectivity=4)
-    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= config.smallest * grey.size]
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= config.smallest * plain.size]
     kernel = np.ones((5, 5), np.uint8)
     return [
         np.asarray(cv2.morphologyEx((labels == k).astype(np.uint8), cv2.MORPH_CLOSE, kernel)) for k in large

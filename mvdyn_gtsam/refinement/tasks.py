@@ -225,8 +225,8 @@ def _plain_regions(context: Context, name: str, frame: Frame) -> tuple[list[Plai
     """Plain regions of a frame, and the trust ``(h, w)`` in its depth; nothing of what moves is trusted."""
     view, trust = context.workspace.views[frame[0]], _still_trust(context, frame)
     moves = np.asarray(context.workspace.read("moving", frame)) != STATIC
-    theta, grey = np.log(context.image(name, frame)), context.luminance(frame)
-    return plain_regions(grey, theta, trust, moves, view.rays, context.config.plain, seed=frame), trust
+    theta, colour = np.log(context.image(name, frame)), context.colour(frame)
+    return plain_regions(colour, theta, trust, moves, view.rays, context.config.plain, seed=frame), trust
 
 
 def _still_trust(context: Context, frame: Frame) -> Float32:

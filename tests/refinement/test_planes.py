@@ -58,10 +58,15 @@ def view_of_room() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return grey, theta, np.where(seen, 0.9, 0.0).astype(np.float32), truth
 
 
+def coloured(luminance: np.ndarray, hue: np.ndarray | float = 128.0) -> np.ndarray:
+    """``(h, w, 3)``"""
+    return np.dstack([luminance, hue + 0.0 * luminance, 128.0 + 0.0 * luminance]).astype(np.float32)
+
+
 def regions_of(seed: int = 0) -> list[PlainRegion]:
     grey, theta, trust, _ = view_of_room()
     nothing = np.zeros(grey.shape, bool)
-    return plain_regions(grey, theta, trust, nothing, RAYS.astype(np.float32), CONFIG, (seed, 0))
+    return plain_regions(coloured(grey), theta, trust, nothing, RAYS.astype(np.float32), CONFIG, (seed, 0))
 
 
 def bank_of(count: int) -> Array:
@@ -107,7 +112,9 @@ def test_a_wall_of_which_only_the_foot_is_seen_stands_upright(axes: Array, share
     """Through one line there are many planes, but one alone is upright."""
     grey, theta, trust, truth = line_below_a_wall()
     rays, nothing = RAYS.astype(np.float32), np.zeros(grey.shape, bool)
-    found = [plain_regions(grey, theta, trust, nothing, rays, CONFIG, (time, 0)) for time in range(8)]
+    found = [
+        plain_regions(coloured(grey), theta, trust, nothing, rays, CONFIG, (time, 0)) for time in range(8)
+    ]
     filled = fill_plain(theta, trust, found[0], bank(found, axes), np.eye(4), axes, CONFIG)
     above = ROW < 30
     left = np.abs(filled - truth)[above].mean() / np.abs(theta - truth)[above].mean()
@@ -183,10 +190,26 @@ def test_a_plane_counts_less_far_from_its_rim() -> None:
     assert top < bottom
 
 
+def test_walls_as_bright_as_each_other_are_told_apart_by_their_hue() -> None:
+    """Two plain walls over a textured floor; in grey they are one."""
+    _, theta, _, _ = view_of_room()
+    random = np.random.default_rng(0)
+    grey = np.full((HEIGHT, WIDTH), 150.0)
+    grey[-12:] = 100.0 + 40.0 * random.random((12, WIDTH))
+    trust = np.zeros((HEIGHT, WIDTH), np.float32)
+    trust[-14:] = 0.9
+    nothing, rays = np.zeros(grey.shape, bool), RAYS.astype(np.float32)
+    hue = np.where(np.arange(WIDTH) < WIDTH // 2, 124.0, 132.0)[None]
+    for colour, count in ((coloured(grey), 1), (coloured(grey, hue), 2)):
+        assert len(plain_regions(colour, theta, trust, nothing, rays, CONFIG, (0, 0))) == count
+
+
 def test_excluded_pixels_belong_to_no_region() -> None:
     grey, theta, trust, _ = view_of_room()
     everything = np.ones(grey.shape, bool)
-    assert plain_regions(grey, theta, trust, everything, RAYS.astype(np.float32), CONFIG, (0, 0)) == []
+    assert (
+        plain_regions(coloured(grey), theta, trust, everything, RAYS.astype(np.float32), CONFIG, (0, 0)) == []
+    )
 
 
 def test_the_draw_is_repeatable() -> None:
