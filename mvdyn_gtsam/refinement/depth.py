@@ -59,7 +59,7 @@ class FrameProblem:
     others: Mapping[Frame, Float32]
     """``theta (h, w)`` of the frames that the edges lead to, as far as L_disp shall use them."""
     image_weights: tuple[Float32, Float32]
-    """Of ``smoothness_weights``."""
+    """Of ``lattice.neighbour_likeness``."""
     prior: DepthPrior
     config: RefinementConfig
 
@@ -174,19 +174,6 @@ def robust_cost(cost: npt.NDArray[np.floating], scale: float) -> npt.NDArray[np.
     """``cost`` with its confidence eliminated: itself up to ``scale``, ``scale (1 + log(cost / scale))``
     beyond."""
     return np.where(cost < scale, cost, scale * (1.0 + np.log(np.maximum(cost, scale) / scale)))
-
-
-def smoothness_weights(grey: npt.NDArray[np.floating], contrast: float) -> tuple[Float32, Float32]:
-    """``(h, w)`` each: how far a pixel of ``grey (h, w)`` shares its depth with its right and lower
-    neighbour.
-
-    0 in the last column and row, which have none.
-    """
-    values = grey.astype(np.float32)
-    across, down = np.zeros(values.shape, np.float32), np.zeros(values.shape, np.float32)
-    across[:, :-1] = np.exp(-np.abs(np.diff(values, axis=1)) / np.float32(contrast))
-    down[:-1] = np.exp(-np.abs(np.diff(values, axis=0)) / np.float32(contrast))
-    return across, down
 
 
 def _add_flow(

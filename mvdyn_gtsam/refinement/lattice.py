@@ -51,3 +51,15 @@ def lattice_solution(matrix: sparse.dia_array, right: Float32, tolerance: float,
         sparse.dia_array((scaled, offsets), matrix.shape), scale * right, rtol=tolerance, maxiter=steps
     )
     return np.asarray(scale * solution, np.float32)
+
+
+def neighbour_likeness(colour: Float32, contrast: float) -> tuple[Float32, Float32]:
+    """``(h, w)`` each: in [0, 1] how like its right and lower neighbour a pixel of ``colour (h, w, C)`` is.
+
+    1/e at a difference of ``contrast``; 0 in the last column and row, which have none.
+    """
+    across, down = (np.zeros(colour.shape[:2], np.float32) for _ in range(2))
+    for likeness, axis in ((across[:, :-1], 1), (down[:-1], 0)):
+        difference = np.diff(colour, axis=axis)
+        likeness[:] = np.exp(-np.sqrt((difference * difference).sum(axis=2)) / np.float32(contrast))
+    return across, down

@@ -18,7 +18,7 @@ from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import Pair
 from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
-from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
+from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, solve_frame
 from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, flow_targets, load_edges
 from mvdyn_gtsam.refinement.growth import growth_task
 from mvdyn_gtsam.refinement.initial import (
@@ -27,6 +27,7 @@ from mvdyn_gtsam.refinement.initial import (
     most_telling,
     static_residual,
 )
+from mvdyn_gtsam.refinement.lattice import neighbour_likeness
 from mvdyn_gtsam.refinement.measurement import carry_sweep, measure_pair, sweep_frame, sweep_moving
 from mvdyn_gtsam.refinement.motion import (
     carry_task,
@@ -362,7 +363,7 @@ def upsample(inverse_depth: Float32, grey: npt.NDArray[np.uint8], contrast: floa
 
 
 def _image_weights(context: Context, frame: Frame) -> tuple[Float32, Float32]:
-    return smoothness_weights(context.luminance(frame), context.config.edge_contrast)
+    return neighbour_likeness(context.colour(frame), context.config.edge_contrast)
 
 
 def run_task(context: Context, task: str, job: object) -> object:

@@ -26,10 +26,10 @@ from mvdyn_gtsam.refinement.depth import (
     cost,
     normal_equations,
     robust_cost,
-    smoothness_weights,
     solve_frame,
 )
 from mvdyn_gtsam.refinement.edges import Edge
+from mvdyn_gtsam.refinement.lattice import neighbour_likeness
 from mvdyn_gtsam.refinement.residuals import confidence
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from tests.refinement.dense_edges import (
@@ -301,7 +301,7 @@ def weak_prior(theta: Float32) -> DepthPrior:
 
 def outlined(truth: Float32) -> tuple[Float32, Float32]:
     """Weights of an image that is plain but for a change of luminance where depth changes."""
-    return smoothness_weights(60.0 * truth, CONFIG.edge_contrast)
+    return neighbour_likeness(60.0 * truth[..., None], CONFIG.edge_contrast)
 
 
 def off_the_truth(theta: Float32) -> Float32:
@@ -339,7 +339,7 @@ def test_more_iterations_do_not_join_depths_that_the_flow_tells_apart(scene: Sce
     """The image is plain: it is for the flow alone to keep the box before the wall."""
     view = small_view(4)
     truth, edges = true_theta(scene, FRAME, view), true_edges(scene, FRAME, view)
-    plain = smoothness_weights(np.zeros(truth.shape), CONFIG.edge_contrast)
+    plain = neighbour_likeness(np.zeros((*truth.shape, 1), np.float32), CONFIG.edge_contrast)
     errors = [
         np.abs(
             solve_frame(truth, FrameProblem(edges, {}, plain, weak_prior(truth), CONFIG), iterations)[0]
@@ -418,20 +418,13 @@ def test_smoothness_does_not_cross_an_edge_of_the_image(edge_at: int | None) -> 
     prior = DepthPrior(np.zeros((12, 20), np.float32), np.full((12, 20), 1e3, np.float32))
     prior.theta[:, 10:], prior.weight[:, 10:] = 0.3, 1e-2
     config = replace(CONFIG, smoothness_scale=1.0, smoothness=5.0)
-    weights = smoothness_weights(grey, config.edge_contrast)
+    weights = neighbour_likeness(grey[..., None], config.edge_contrast)
     solved, _ = solve_frame(prior.theta, FrameProblem([], {}, weights, prior, config), 10)
     np.testing.assert_allclose(solved[:, :10], 0.0, atol=0.02)
     if edge_at is None:
         assert solved[:, 10:].max() < 0.05
     else:
         np.testing.assert_allclose(solved[:, 10:], 0.3, atol=1e-3)
-
-
-def test_smoothness_weights_fall_with_contrast() -> None:
-    grey = np.array([[0.0, 0.0, 5.0], [10.0, 0.0, 5.0]])
-    across, down = smoothness_weights(grey, 5.0)
-    np.testing.assert_allclose(across, np.exp([[0.0, -1.0, -np.inf], [-2.0, -1.0, -np.inf]]), rtol=1e-6)
-    np.testing.assert_allclose(down, [[np.exp(-2.0), 1.0, 1.0], [0.0, 0.0, 0.0]], rtol=1e-6)
 
 
 @given(st.floats(1e-3, 1e3), st.floats(0.01, 10.0))

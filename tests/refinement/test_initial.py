@@ -10,7 +10,7 @@ import pytest
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
-from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, smoothness_weights, solve_frame
+from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, solve_frame
 from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, FlowTargets, flow_targets
 from mvdyn_gtsam.refinement.initial import (
     _triangulated,
@@ -22,6 +22,7 @@ from mvdyn_gtsam.refinement.initial import (
     proven_still,
     static_residual,
 )
+from mvdyn_gtsam.refinement.lattice import neighbour_likeness
 from mvdyn_gtsam.refinement.residuals import confidence
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from tests.refinement.dense_edges import (
@@ -311,7 +312,7 @@ def test_temporal_edges_of_what_moves_lose_their_weight_by_themselves(
     seen = with_motion(edges, block, (1.5, -2.5))
     start = np.log(truth) + np.float32(0.03)
     prior = DepthPrior(start, np.full(start.shape, 1.0, np.float32))
-    image = smoothness_weights(60.0 * np.log(truth), CONFIG.edge_contrast)
+    image = neighbour_likeness(60.0 * np.log(truth)[..., None].astype(np.float32), CONFIG.edge_contrast)
     config = replace(CONFIG, smoothness=0.2)
     solved, _ = solve_frame(start, FrameProblem(seen, {}, image, prior, config), 10)
     rho = np.exp(solved).ravel()

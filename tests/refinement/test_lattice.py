@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mvdyn_gtsam.refinement.lattice import lattice_solution, lattice_system
+from mvdyn_gtsam.refinement.lattice import lattice_solution, lattice_system, neighbour_likeness
 
 Float32 = np.typing.NDArray[np.float32]
 
@@ -41,3 +41,14 @@ def test_the_solution_is_that_of_a_dense_solver(shape: tuple[int, int]) -> None:
 def test_what_nothing_pulls_stays_zero() -> None:
     matrix = lattice_system(*random_weights(6, (4, 4)))
     assert not lattice_solution(matrix, np.zeros(16, np.float32), 0.005, 10).any()
+
+
+def test_neighbours_are_less_alike_the_more_they_differ() -> None:
+    grey = np.array([[0.0, 0.0, 5.0], [10.0, 0.0, 5.0]], np.float32)[..., None]
+    across, down = neighbour_likeness(grey, 5.0)
+    np.testing.assert_allclose(across, np.exp([[0.0, -1.0, -np.inf], [-2.0, -1.0, -np.inf]]), rtol=1e-6)
+    np.testing.assert_allclose(down, [[np.exp(-2.0), 1.0, 1.0], [0.0, 0.0, 0.0]], rtol=1e-6)
+    # of one luminance, but not of one hue
+    colour = np.zeros((1, 2, 3), np.float32)
+    colour[0, 1] = 0.0, 3.0, 4.0
+    np.testing.assert_allclose(neighbour_likeness(colour, 5.0)[0], [[np.exp(-1.0), 0.0]], rtol=1e-6)
