@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,6 +82,7 @@ def measure(
         if folder.exists():
             shutil.rmtree(folder)
         shutil.copytree(tracked, folder)
+        _take_present_settings(folder)
         settings = [*VARIANTS[variant], *overrides]
         usage = _run(capture, folder, ["--resume", *settings_arguments(settings)])
         seconds = Reconstruction.load(folder).diagnostics("refinement_seconds")
@@ -95,6 +98,15 @@ def measure(
         "step_seconds": seconds,
         "scores": scores,
     }
+
+
+def _take_present_settings(folder: Path) -> None:
+    """Let a tracked folder be refined with the settings that hold now: ``--resume`` goes on with those that
+    were the defaults when it was tracked."""
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["config"]["refinement"] = asdict(load_config(None, []).refinement)
+    path.write_text(json.dumps(manifest))
 
 
 def folder_of(work: Path, capture: Path, variant: str) -> Path:

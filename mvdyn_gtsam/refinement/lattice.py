@@ -59,7 +59,9 @@ def neighbour_likeness(colour: Float32, contrast: float) -> tuple[Float32, Float
     1/e at a difference of ``contrast``; 0 in the last column and row, which have none.
     """
     across, down = (np.zeros(colour.shape[:2], np.float32) for _ in range(2))
-    for likeness, axis in ((across[:, :-1], 1), (down[:-1], 0)):
-        difference = np.diff(colour, axis=axis)
-        likeness[:] = np.exp(-np.sqrt((difference * difference).sum(axis=2)) / np.float32(contrast))
+    # channel by channel, a third of the time less
+    channels = np.ascontiguousarray(np.moveaxis(colour, 2, 0))
+    for likeness, axis in ((across[:, :-1], 2), (down[:-1], 1)):
+        difference = np.diff(channels, axis=axis)
+        likeness[:] = np.exp(np.sqrt((difference * difference).sum(axis=0)) / np.float32(-contrast))
     return across, down

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from matplotlib.figure import Figure
 
 from experiments import refinement_phases
 from experiments.refinement_phases import COLUMNS, on_tracking_rows, row
+from mvdyn_gtsam.refinement.settings import RefinementConfig
 
 
 def entry(capture: str, variant: str, **scores: float | None) -> dict[str, Any]:
@@ -46,6 +48,29 @@ def test_both_plots_have_a_bar_per_variant() -> None:
         figure = Figure()
         draw(figure, entries)
         assert all(len(axes.containers) == 2 for axes in figure.axes)
+
+
+def test_what_was_tracked_earlier_is_refined_with_the_settings_of_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The resumed run must not go on with defaults of the day of the tracking."""
+    capture, seen = tmp_path / "clip", []
+    tracked = refinement_phases.folder_of(tmp_path, capture, "tracking")
+    tracked.mkdir(parents=True)
+    old = {"refinement": {"moving_sigma": 7.0}, "tracking": {"window": 9}}
+    (tracked / "manifest.json").write_text(json.dumps({"config": old}))
+
+    def run(capture: Path, folder: Path, arguments: list[str]) -> None:
+        seen.append(json.loads((folder / "manifest.json").read_text())["config"])
+        raise InterruptedError
+
+    monkeypatch.setattr(refinement_phases, "_track", lambda capture, folder: None)
+    monkeypatch.setattr(refinement_phases, "_run", run)
+    with pytest.raises(InterruptedError):
+        refinement_phases.measure(capture, "phases 1, 2", tmp_path, None, [])
+    assert seen[0]["refinement"]["moving_sigma"] == RefinementConfig().moving_sigma
+    assert seen[0]["tracking"] == {"window": 9}
+    assert json.loads((tracked / "manifest.json").read_text())["config"] == old
 
 
 def test_an_unknown_setting_is_refused_before_any_work(
