@@ -174,9 +174,9 @@ class RefinementConfig:
     """How far outside such a region its outline is looked for, as a share of the image's width. Source:
     compared on three_cameras and dynamic_human, 0.02 to 0.1; no sweep is kept."""
     moving_contrast: float = 11.0
-    """Grey levels by which the colour of a moving pixel differs from what stands behind it. Source: 11 to 15
-    compared on six rendered scenes: above noise and what an error of pose or depth makes of texture. Of
-    luminance alone 9 and 11: up to twice as much of what moves was missed."""
+    """Grey levels by which the colour of a moving pixel differs at least from what stands behind it. Source:
+    11 to 15 compared on six rendered scenes: above noise and what an error of pose or depth makes of texture.
+    Of luminance alone 9 and 11: up to twice as much of what moves was missed."""
     background_offsets: tuple[int, ...] = (8, 12, 16, 24, 32, 40)
     """Distances in frames, both ways, at which what stands behind is looked for. Source: choice."""
     background_margin: float = 0.02
