@@ -3,7 +3,7 @@
 The unknown of a pixel is ``theta = log rho``, the log of its inverse depth. L_flow ties it to the flow,
 L_disp to the depth that other frames have where the flow leads, smoothness to its four neighbours where the
 image has no edge. Every Gauss-Newton step is a sparse symmetric system with five diagonals, solved by
-conjugate gradients with the diagonal as preconditioner; confidences and absolute values are weights,
+conjugate gradients; confidences and absolute values are weights,
 renewed at each step. Frames are solved in turn, each with the newest depth of the others: block Gauss-Seidel.
 """
 
@@ -15,12 +15,11 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.edges import Edge
-from mvdyn_gtsam.refinement.lattice import lattice_solution, lattice_system
+from mvdyn_gtsam.refinement.lattice import Lattice, lattice_solution
 from mvdyn_gtsam.refinement.residuals import FlowTerms, confidence, ratio_terms, reweighted
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 
@@ -91,12 +90,11 @@ class Agreement:
 class Normal:
     """Gauss-Newton system of one frame."""
 
-    matrix: sparse.dia_array
-    """``(N, N)`` symmetric, five diagonals."""
+    lattice: Lattice
     gradient: Float32
-    """``(N,)``"""
+    """``(h, w)``"""
     information: Float32
-    """``(N,)`` what the flow alone says about each pixel: inverse variance of ``theta``."""
+    """``(h, w)`` what the flow alone says about each pixel: inverse variance of ``theta``."""
 
 
 def solve_frame(
@@ -110,9 +108,9 @@ def solve_frame(
         # depth edges are found coarse to fine: a wide kernel first
         widening = min(WIDEST_KERNEL, 2.0 ** max(0, iterations - 2 - iteration))
         normal = normal_equations(theta, problem, widening)
-        step = lattice_solution(normal.matrix, -normal.gradient, SOLVER_TOLERANCE, SOLVER_STEPS)
-        theta = theta + np.clip(step, -LARGEST_STEP, LARGEST_STEP).reshape(theta.shape).astype(np.float32)
-        information = normal.information.reshape(theta.shape)
+        step = lattice_solution(normal.lattice, -normal.gradient, SOLVER_TOLERANCE, SOLVER_STEPS)
+        theta = theta + np.clip(step, -LARGEST_STEP, LARGEST_STEP)
+        information = normal.information
     return theta, information
 
 
@@ -131,11 +129,10 @@ def normal_equations(
         _add_flow(information, gradient, edge, rho, terms, config)
         if there is not None:
             _add_ratio(agreement, gradient, edge, rho, terms, there, config)
-    diagonal = information + agreement + prior.weight.ravel()
-    gradient += (prior.weight * (theta - prior.theta)).ravel()
-    across, down, smooth_gradient = _smoothness(theta, problem.image_weights, config, widening)
-    matrix = lattice_system(diagonal.reshape(theta.shape), across, down)
-    return Normal(matrix, gradient + smooth_gradient.ravel(), information)
+    across, down, total = _smoothness(theta, problem.image_weights, config, widening)
+    total += gradient.reshape(theta.shape) + prior.weight * (theta - prior.theta)
+    diagonal = (information + agreement).reshape(theta.shape) + prior.weight
+    return Normal(Lattice(diagonal, across, down), total, information.reshape(theta.shape))
 
 
 def cost(

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.refinement.initial import known_median
-from mvdyn_gtsam.refinement.lattice import lattice_solution, lattice_system, neighbour_likeness
+from mvdyn_gtsam.refinement.lattice import Lattice, lattice_solution, neighbour_likeness
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import pixels_seen
 
@@ -154,8 +154,8 @@ def _evidence(colour: Float32, behind: Float32, known: Mask, config: RefinementC
 def _persuaded(pull: Float32, total: Float32, colour: Float32) -> Float32:
     """``(h, w)`` evidence ``pull / total`` after neighbours of like ``colour (h, w, 3)`` shared it."""
     across, down = neighbour_likeness(colour, CONTRAST)
-    matrix = lattice_system(total, np.float32(LIKENESS) * across, np.float32(LIKENESS) * down)
-    return lattice_solution(matrix, pull.ravel(), TOLERANCE, MOST_STEPS).reshape(pull.shape)
+    lattice = Lattice(total, np.float32(LIKENESS) * across, np.float32(LIKENESS) * down)
+    return lattice_solution(lattice, pull, TOLERANCE, MOST_STEPS)
 
 
 def _with_margin(positions: npt.NDArray[np.int64]) -> slice:

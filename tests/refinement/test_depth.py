@@ -109,7 +109,7 @@ def test_the_gradient_is_that_of_the_cost(seed: int, only: str) -> None:
     if only not in ("prior", "all"):
         nothing = DepthPrior(given_.prior.theta, np.zeros_like(given_.prior.weight))
         given_ = replace(given_, prior=nothing)
-    gradient = normal_equations(given_.theta, given_.with_config(config)).gradient
+    gradient = normal_equations(given_.theta, given_.with_config(config)).gradient.ravel()
     numeric = np.empty(given_.theta.size)
     step = 1e-6
     for pixel in range(given_.theta.size):
@@ -191,7 +191,7 @@ def test_the_five_diagonals_are_the_explicit_system(seed: int) -> None:
     given_ = problem(seed)
     # beyond so wide a kernel the links are of all strengths
     config = replace(CONFIG, smoothness_scale=0.05)
-    matrix = normal_equations(given_.theta, given_.with_config(config)).matrix.toarray()
+    matrix = normal_equations(given_.theta, given_.with_config(config)).lattice.matrix().toarray()
     np.testing.assert_allclose(matrix, explicit_matrix(given_, config), rtol=2e-3, atol=1e-2)
     np.testing.assert_array_equal(matrix, matrix.T)
     assert np.linalg.eigvalsh(matrix.astype(np.float64)).min() > 0.0
@@ -208,7 +208,9 @@ def test_the_step_solves_the_system(seed: int, monkeypatch: pytest.MonkeyPatch) 
     given_ = problem(seed)
     frame = given_.with_config(CONFIG)
     normal = normal_equations(given_.theta, frame)
-    expected = spsolve(normal.matrix.tocsc().astype(np.float64), -normal.gradient.astype(np.float64))
+    expected = spsolve(
+        normal.lattice.matrix().tocsc().astype(np.float64), -normal.gradient.ravel().astype(np.float64)
+    )
     assert np.abs(expected).max() < depth.LARGEST_STEP
     monkeypatch.setattr(depth, "SOLVER_TOLERANCE", 1e-6)
     solved, _ = solve_frame(given_.theta, frame, iterations=1)
@@ -226,9 +228,9 @@ def test_information_is_that_of_the_flow_alone() -> None:
     nothing = DepthPrior(given_.prior.theta, np.zeros_like(given_.prior.weight))
     alone = replace(given_, others={}, prior=nothing)
     flow = normal_equations(given_.theta, alone.with_config(replace(CONFIG, smoothness=0.0)))
-    np.testing.assert_allclose(flow.matrix.diagonal(), flow.information)
+    np.testing.assert_allclose(flow.lattice.total(), flow.information)
     np.testing.assert_allclose(whole.information, flow.information)
-    assert (flow.information[:3] == 0.0).all() and (flow.information[3:] > 0.0).any()
+    assert (flow.information.ravel()[:3] == 0.0).all() and (flow.information.ravel()[3:] > 0.0).any()
 
 
 def stacked(given_: Problem, config: RefinementConfig, floors: tuple[float, float]) -> Any:
@@ -281,7 +283,7 @@ def test_a_general_descent_ends_at_no_lower_robust_cost(seed: int) -> None:
     def objective(flat: Array) -> tuple[float, Array]:
         theta = flat.reshape(given_.theta.shape)
         gradient = normal_equations(theta, given_.with_config(config)).gradient
-        return cost(theta, given_.with_config(config)), gradient.astype(np.float64)
+        return cost(theta, given_.with_config(config)), gradient.ravel().astype(np.float64)
 
     found, _ = solve_frame(given_.theta, given_.with_config(config), 20)
     before, after = objective(given_.theta.ravel())[0], objective(found.ravel().astype(np.float64))[0]

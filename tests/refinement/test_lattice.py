@@ -2,45 +2,62 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import sparse
+from scipy.sparse.linalg import cg, spsolve
 
-from mvdyn_gtsam.refinement.lattice import lattice_solution, lattice_system, neighbour_likeness
+from mvdyn_gtsam.refinement.lattice import Lattice, lattice_solution, neighbour_likeness
 
 Float32 = np.typing.NDArray[np.float32]
 
 
-def random_weights(seed: int, shape: tuple[int, int]) -> tuple[Float32, Float32, Float32]:
-    """Diagonal, and weights to the right and below."""
+def random_lattice(seed: int, shape: tuple[int, int]) -> Lattice:
+    """Of weights that differ from pixel to pixel."""
     rng = np.random.default_rng(seed)
     diagonal, across, down = rng.uniform(0.1, 3.0, (3, *shape)).astype(np.float32)
     across[:, -1], down[-1] = 0.0, 0.0
-    return diagonal, across, down
+    return Lattice(diagonal, across, down)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_matrix_is_that_of_the_quadratic_form(seed: int) -> None:
-    diagonal, across, down = random_weights(seed, (5, 7))
-    matrix = lattice_system(diagonal, across, down)
+    lattice = random_lattice(seed, (5, 7))
+    matrix = lattice.matrix().toarray()
     x = np.random.default_rng(seed + 10).normal(size=(5, 7)).astype(np.float32)
-    form = (diagonal * x**2).sum() + (across[:, :-1] * np.diff(x, axis=1) ** 2).sum()
-    form += (down[:-1] * np.diff(x, axis=0) ** 2).sum()
-    assert x.ravel() @ (matrix @ x.ravel()) == pytest.approx(form, rel=1e-5)
-    np.testing.assert_array_equal(matrix.toarray(), matrix.toarray().T)
+    form = (lattice.diagonal * x**2).sum() + (lattice.across[:, :-1] * np.diff(x, axis=1) ** 2).sum()
+    form += (lattice.down[:-1] * np.diff(x, axis=0) ** 2).sum()
+    assert x.ravel() @ matrix @ x.ravel() == pytest.approx(form, rel=1e-5)
+    np.testing.assert_array_equal(matrix, matrix.T)
+    np.testing.assert_array_equal(matrix.diagonal(), lattice.total().ravel())
 
 
-@pytest.mark.parametrize("shape", [(5, 7), (1, 6), (6, 2)])
+@pytest.mark.parametrize("shape", [(5, 7), (1, 6), (6, 2), (6, 1), (4, 8), (7, 8), (1, 1)])
 def test_the_solution_is_that_of_a_dense_solver(shape: tuple[int, int]) -> None:
-    weights = random_weights(4, shape)
-    matrix = lattice_system(*weights)
-    right = np.random.default_rng(5).normal(size=matrix.shape[0]).astype(np.float32)
-    found = lattice_solution(matrix, right, 1e-6, 200)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix.toarray(), right), rtol=1e-4, atol=1e-5)
+    lattice = random_lattice(4, shape)
+    right = np.random.default_rng(5).normal(size=shape).astype(np.float32)
+    found = lattice_solution(lattice, right, 1e-6, 200)
+    expected = np.linalg.solve(lattice.matrix().toarray(), right.ravel())
+    np.testing.assert_allclose(found.ravel(), expected, rtol=1e-4, atol=1e-5)
+    assert found.dtype == np.float32
+
+
+def test_the_solution_takes_half_the_steps_of_the_whole_system() -> None:
+    lattice = random_lattice(7, (40, 50))
+    lattice = replace(lattice, diagonal=0.01 * lattice.diagonal)
+    right = np.random.default_rng(8).normal(size=(40, 50)).astype(np.float32)
+    matrix, root = lattice.matrix().tocsr(), sparse.diags_array(lattice.total().ravel() ** -0.5)
+    whole: list[object] = []
+    cg(root @ matrix @ root, root @ right.ravel(), rtol=1e-3, callback=whole.append)
+    exact = spsolve(matrix.tocsc().astype(np.float64), right.ravel().astype(np.float64))
+    found = lattice_solution(lattice, right, 0.0, len(whole) // 2)
+    assert np.abs(found.ravel() - exact).max() < 0.01 * np.abs(exact).max()
 
 
 def test_what_nothing_pulls_stays_zero() -> None:
-    matrix = lattice_system(*random_weights(6, (4, 4)))
-    assert not lattice_solution(matrix, np.zeros(16, np.float32), 0.005, 10).any()
+    assert not lattice_solution(random_lattice(6, (4, 4)), np.zeros((4, 4), np.float32), 0.005, 10).any()
 
 
 def test_neighbours_are_less_alike_the_more_they_differ() -> None:
