@@ -30,6 +30,11 @@ TRUSTED = 0.5
 WITNESSES = 2
 """Views that must see through a point; and they must be twice as many as see the point. Source: choice."""
 
+SIGHT = "sight"
+"""The array of what others see at a frame's first depth: nothing is told, a surface, or what is behind."""
+STANDS, SEEN_THROUGH = 1, 2
+"""Of it."""
+
 
 class SeeingView(Protocol):
     """What is asked of any view."""

@@ -125,7 +125,7 @@ def carried_regions(
     targets: FlowTargets,
     there: Sequence[npt.NDArray[np.uint8]],
     beside: Mask,
-    stands: npt.NDArray[np.uint8],
+    stands: Mask,
     config: RefinementConfig,
 ) -> npt.NDArray[np.uint8]:
     """Where the static model fails in the frame of a ``time`` ``(h, w)``, with what moves in those before or
@@ -143,7 +143,7 @@ def carried_regions(
         carried |= (count > 0.0) & (votes >= config.carried_share * count)
         found_flow |= count > 0.0
     carried |= ~found_flow & beside.ravel()
-    found = _whole_regions(carried.reshape(own.shape) & (stands == 0), config)
+    found = _whole_regions(carried.reshape(own.shape) & ~stands, config)
     return np.maximum(own, (found > 0).astype(np.uint8))
 
 

@@ -45,12 +45,12 @@ class Lattice:
 
 
 def lattice_solution(lattice: Lattice, right: Float32, tolerance: float, steps: int) -> Float32:
-    """``x (h, w)`` with ``matrix x = right (h, w)``, by at most so many ``steps`` of conjugate gradients up to
-    that relative residual.
+    """``x (h, w)`` with ``matrix x = right (h, w)``, by at most so many ``steps`` of conjugate gradients up
+    to that relative residual.
 
-    The pixels are those of a chessboard: black ones are tied to red ones only, so that these are eliminated by
-    a division each. What is left, ``I - C^T C`` once the diagonal is scaled to 1, takes half the steps at the
-    same price (https://doi.org/10.1137/0709032).
+    The pixels are those of a chessboard: black ones are tied to red ones only, so that these are eliminated
+    by a division each. What is left, ``I - C^T C`` once the diagonal is scaled to 1, takes half the steps at
+    the same price (https://doi.org/10.1137/0709032).
     """
     width = lattice.diagonal.shape[1]
     # even, so that every row has as many black pixels as red ones, and no two diagonals fall together

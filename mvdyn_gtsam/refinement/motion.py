@@ -1,10 +1,11 @@
 """What moves in a frame, and where phase 2 begins with it.
 
-Eight steps, since a frame asks others: ``free_space_task`` adds what other views see through to where the
+Ten steps, since a frame asks others: ``free_space_task`` adds what other views see through to where the
 static model fails; ``carry_task`` what moves before and after; ``settle_task`` finds what moves and its
 outline; ``observe_task`` asks the cameras of the instant for the depth of each region, ``growth_task`` the
 frames after for how it grows; ``depth_of_regions`` makes that one over time; ``moving_depth_task`` writes it;
-``relief_task`` makes one over time how the points of a region lie about its depth.
+``fit_task`` and ``shape_task`` give it the shape that the cameras of the instant agree on; ``relief_task``
+makes one over time how the points of a region lie about its depth.
 """
 
 from __future__ import annotations
@@ -20,7 +21,16 @@ from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
-from mvdyn_gtsam.refinement.free_space import BEHIND, TRUSTED, DepthView, sight, without_outlines
+from mvdyn_gtsam.refinement.free_space import (
+    BEHIND,
+    SEEN_THROUGH,
+    SIGHT,
+    STANDS,
+    TRUSTED,
+    DepthView,
+    sight,
+    without_outlines,
+)
 from mvdyn_gtsam.refinement.ground import footing
 from mvdyn_gtsam.refinement.initial import (
     carried_regions,
@@ -82,9 +92,10 @@ def free_space_task(context: Context, frame: Frame) -> None:
     seen = sight(theta[every].ravel(), rays.reshape(-1, 3), views)
     through, there = (mask.reshape(rays.shape[:2]) for mask in (seen.seen_through, seen.seen_there))
     trusted = through & (context.trust(frame)[every] > SETTLED)
-    marked, settled, stands = (
-        cv2.resize(mask.astype(np.uint8), view.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        for mask in (without_outlines(through), trusted, there)
+    told = np.where(through, SEEN_THROUGH, np.where(there, STANDS, 0))
+    marked, settled, told = (
+        cv2.resize(np.asarray(mask, np.uint8), view.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        for mask in (without_outlines(through), trusted, told)
     )
     found = regions(closed(marked, config), config)
     for label in range(1, int(found.max()) + 1):
@@ -93,7 +104,7 @@ def free_space_task(context: Context, frame: Frame) -> None:
         if settled[region].mean() < SETTLED_SHARE:
             found[found == label] = 0
     workspace.write("fails", frame, np.maximum(np.asarray(workspace.read("fails", frame)), found > 0))
-    workspace.write("stands", frame, stands)
+    workspace.write(SIGHT, frame, told)
 
 
 def _witnesses(context: Context, frame: Frame) -> list[DepthView]:
@@ -125,9 +136,9 @@ def carry_task(context: Context, job: tuple[str, str, Frame]) -> None:
     workspace = context.workspace
     targets = context.flow_targets(frame)
     there = [np.asarray(workspace.read(source, (frame[0], int(time)))) for time in targets.times]
-    own, stands = (np.asarray(workspace.read(name, frame)) for name in (source, "stands"))
+    own, seen = (np.asarray(workspace.read(name, frame)) for name in (source, SIGHT))
     beside = _seen_beside(context, source, frame) & (context.trust(frame) < TRUSTED)
-    found = carried_regions(own, frame[1], targets, there, beside, stands, context.config)
+    found = carried_regions(own, frame[1], targets, there, beside, seen == STANDS, context.config)
     workspace.write(target, frame, found)
 
 
@@ -187,8 +198,10 @@ def _what_moves(context: Context, frame: Frame) -> tuple[Labels, Mask]:
     residual = static_residual(np.exp(context.image("first", frame)), edges)
     explained = (residual < config.moving_px) & (own == 0)
     around = near & ~explained | (labels > 0)
-    # between things that move, their regions close over what stands there
-    still = proven_still(residual, edges, config)
+    # between things that move, their regions close over what stands there; a thing that moves evenly past the
+    # camera has the flow of a still one, through which others see
+    seen = np.asarray(context.workspace.read(SIGHT, frame))
+    still = proven_still(residual, edges, config) & (seen != SEEN_THROUGH)
     labels[still] = 0
     return labels, around & ~still
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.frontend.plane_sweep import SweepConfig, SweepView, lowest, patch_likeness, semi_global
-from mvdyn_gtsam.refinement.moving_depth import PATCH, InstantView, contradicted, same_side, side_seen
+from mvdyn_gtsam.refinement.moving_depth import PATCH, InstantView, contradicted, own_say, side_seen
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -34,9 +34,6 @@ DENIED = np.float32(2.0)
 PRIOR, PRIOR_REACH = np.float32(0.6), np.float32(0.3)
 """Cost of a log depth so far or farther from the region's. Source: 0.4 to 3 and 0.15 to 0.6 compared there:
 more keeps what meets in the image together."""
-LEAST_SAY = 0.6
-"""Of ``SAY`` that is left to a view that sees another side. Source: 0.3, 0.6 and 1 compared there, all within
-3 %."""
 
 
 def swept_region(
@@ -63,8 +60,7 @@ def swept_region(
     best = np.zeros((len(tried), len(own)), np.float32)
     for view in views:
         alike = patch_likeness(crop, shifted, _sweep_view(view), np.exp(tried), SWEEP)[:, inside]
-        say = LEAST_SAY + (1.0 - LEAST_SAY) * same_side(log_inverse_depth, own, view)
-        np.maximum(best, np.float32(say) * alike, out=best)
+        np.maximum(best, np.float32(own_say(log_inverse_depth, own, view.jTi)) * alike, out=best)
     cost = PRIOR * np.minimum(np.abs(tried - tried[STEPS]) / PRIOR_REACH, 1.0)[:, None] - SAY * best
     for each, theta in zip(cost, tried, strict=True):
         each += DENIED * contradicted(np.full(len(own), theta, np.float32), own, views)

@@ -23,8 +23,10 @@ from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.refinement.axes import main_axes
 from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_pairs
 from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context, smooth_colour
+from mvdyn_gtsam.refinement.free_space import SIGHT
 from mvdyn_gtsam.refinement.growth import Growth
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
+from mvdyn_gtsam.refinement.moving_shape import ALIKE, FITTED
 from mvdyn_gtsam.refinement.neighbours import swept_times
 from mvdyn_gtsam.refinement.over_time import depth_of_regions
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
@@ -43,10 +45,10 @@ Array = npt.NDArray[np.float64]
 
 BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
-BYTES_PER_PIXEL = 97.0
-"""Of a view on disk besides its flow: fourteen arrays of 32 bits, nine of 8, and where flow leads at about
+BYTES_PER_PIXEL = 105.0
+"""Of a view on disk besides its flow: sixteen arrays of 32 bits, nine of 8, and where flow leads at about
 eight other times."""
-WORKSPACE_FORMAT = 3
+WORKSPACE_FORMAT = 4
 """Raised when what lies on disk changes: a refinement that an earlier version began is begun anew."""
 FAILS, CARRIED = "fails", "carried"
 """The arrays of where the static model fails that ``carry`` reads and writes in turn."""
@@ -201,12 +203,12 @@ class Refinement:
         workspace.create("grey", np.uint8, full_size=True)
         workspace.create(COLOUR, np.uint8, channels=(3,))
         workspace.create("moving", np.uint8)
-        for name in (FAILS, CARRIED, "stands", "held"):
+        for name in (FAILS, CARRIED, SIGHT, "held"):
             workspace.create(name, np.uint8)
         workspace.create(LABELS, np.uint8)
         for name in (
             "tracked", "tracked_confidence", "aligned", "swept", "instant", "prior", "prior_weight", "first",
-            "begun", "information", RELIEF,
+            "begun", "information", RELIEF, FITTED, ALIKE,
         ):  # fmt: skip
             workspace.create(name)
         for done, frame in enumerate(self._frames):
@@ -255,7 +257,8 @@ class Refinement:
             grown.append(growths)
         depths = depth_of_regions(self._context, self._frames, found, grown)
         self._map("moving depth", list(zip(self._frames, depths, strict=True)))
-        self._map("relief", self._frames)
+        for task in ("fit", "shape", "relief"):
+            self._map(task, self._frames)
 
     def _sample(self) -> Callable[[], Iterable[FrameSample]]:
         """Sample every frame once; what is returned reads them back, as often as a solve asks."""

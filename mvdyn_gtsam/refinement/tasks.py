@@ -36,6 +36,7 @@ from mvdyn_gtsam.refinement.motion import (
     observe_task,
     settle_task,
 )
+from mvdyn_gtsam.refinement.moving_shape import fit_task, shape_task
 from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
 from mvdyn_gtsam.refinement.planes import (
     PlainRegion,
@@ -384,6 +385,8 @@ TASKS = {
     "observe": observe_task,
     "growth": growth_task,
     "moving depth": moving_depth_task,
+    "fit": fit_task,
+    "shape": shape_task,
     "relief": relief_task,
     "window": window_task,
     "surfaces": surfaces_task,

@@ -12,6 +12,7 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
 from mvdyn_gtsam.refinement.context import COLOUR, Context, smooth_colour, trust_of
 from mvdyn_gtsam.refinement.edges import flow_targets
+from mvdyn_gtsam.refinement.free_space import SIGHT
 from mvdyn_gtsam.refinement.motion import settle_task
 from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
 from mvdyn_gtsam.refinement.settings import RefinementConfig
@@ -39,7 +40,7 @@ def made(folder: Path, contrast: float) -> Context:
     workspace.prepare("settings")
     workspace.create("grey", np.uint8, full_size=True)
     workspace.create(COLOUR, np.uint8, channels=(3,))
-    for name in ("held", "fails", "labels"):
+    for name in ("held", "fails", "labels", SIGHT):
         workspace.create(name, np.uint8)
     for name in ("tracked", "aligned", "swept", "first", "information", "prior", "prior_weight"):
         workspace.create(name)

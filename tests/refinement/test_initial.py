@@ -236,7 +236,7 @@ def carried(edges: list[Edge], block: Mask, seen_by: Callable[[Edge], bool], sta
     """Where the static model fails in a frame that saw nothing itself, of a block that some others saw."""
     there = [(block & seen_by(edge)).astype(np.uint8) for edge in edges]
     own, nowhere = np.zeros(VIEW.shape, np.uint8), np.zeros(VIEW.shape, bool)
-    return carried_regions(own, TIME, targets(edges), there, nowhere, stands.astype(np.uint8), CONFIG) > 0
+    return carried_regions(own, TIME, targets(edges), there, nowhere, stands, CONFIG) > 0
 
 
 def test_what_all_frames_of_one_side_see_move_is_carried(own_edges: list[Edge]) -> None:
@@ -269,20 +269,19 @@ def test_what_others_see_stand_there_is_not_carried(own_edges: list[Edge]) -> No
 def test_what_a_frame_sees_itself_stays(own_edges: list[Edge]) -> None:
     own, nothing = square(20, 30, 16).astype(np.uint8), np.zeros(VIEW.shape, np.uint8)
     nowhere, there = nothing > 0, [nothing] * len(own_edges)
-    assert (carried_regions(own, TIME, targets(own_edges), there, nowhere, nothing, CONFIG) == own).all()
+    assert (carried_regions(own, TIME, targets(own_edges), there, nowhere, nowhere, CONFIG) == own).all()
 
 
 def test_what_is_too_fast_for_flow_moves_where_the_next_frames_see_it(own_edges: list[Edge]) -> None:
     block, nothing = square(20, 30, 16), np.zeros(VIEW.shape, np.uint8)
+    nowhere = nothing > 0
     there = [nothing] * len(own_edges)
     lost = [replace(edge, weight=edge.weight * ~block.ravel()[edge.pixels]) for edge in own_edges]
-    found = carried_regions(nothing, TIME, targets(lost), there, block, nothing, CONFIG) > 0
+    found = carried_regions(nothing, TIME, targets(lost), there, block, nowhere, CONFIG) > 0
     assert found[block].mean() > 0.9 and found[~block].mean() < 0.02
     # flow that finds it standing still has the say, and so have others who see it stand
-    assert not carried_regions(nothing, TIME, targets(own_edges), there, block, nothing, CONFIG).any()
-    assert not carried_regions(
-        nothing, TIME, targets(lost), there, block, block.astype(np.uint8), CONFIG
-    ).any()
+    assert not carried_regions(nothing, TIME, targets(own_edges), there, block, nowhere, CONFIG).any()
+    assert not carried_regions(nothing, TIME, targets(lost), there, block, block, CONFIG).any()
 
 
 def test_what_two_frames_find_where_it_would_be_is_still(own_edges: list[Edge]) -> None:

@@ -7,10 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from mvdyn_gtsam.capture.model import Camera
-from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
+from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig, FlowPair
+from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context
 from mvdyn_gtsam.refinement.edges import flow_targets
-from mvdyn_gtsam.refinement.motion import LEAK_REACH, OWN_SHARE, carry_task, kept_far_off, settle_task
+from mvdyn_gtsam.refinement.free_space import SEEN_THROUGH, SIGHT, STANDS
+from mvdyn_gtsam.refinement.motion import (
+    LEAK_REACH,
+    OWN_SHARE,
+    carry_task,
+    free_space_task,
+    kept_far_off,
+    settle_task,
+)
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
@@ -37,7 +46,7 @@ def test_what_is_too_fast_for_flow_is_carried_from_the_next_frames(tmp_path: Pat
     workspace.prepare("test")
     for name in ("first", "information"):
         workspace.create(name)
-    for name in ("fails", "carried", "stands"):
+    for name in ("fails", "carried", SIGHT):
         workspace.create(name, np.uint8)
     block = np.zeros(view.shape, np.uint8)
     block[10:30, 20:40] = 1
@@ -68,7 +77,7 @@ def test_what_other_times_see_behind_a_thing_holds_the_depth_beside_it(tmp_path:
     workspace.prepare("test")
     for name in ("first", "information", "prior", "prior_weight"):
         workspace.create(name)
-    for name in ("fails", "held", LABELS):
+    for name in ("fails", "held", LABELS, SIGHT):
         workspace.create(name, np.uint8)
     workspace.create(COLOUR, np.uint8, channels=(3,))
     block, fat = np.zeros(view.shape, bool), np.zeros(view.shape, bool)
@@ -89,3 +98,42 @@ def test_what_other_times_see_behind_a_thing_holds_the_depth_beside_it(tmp_path:
     beside = fat & ~found
     np.testing.assert_allclose(context.image("prior", middle)[beside], -np.log(2.0), atol=1e-3)
     np.testing.assert_allclose(context.image("prior_weight", middle)[beside], config.behind_sigma**-2)
+
+
+def test_a_thing_with_the_flow_of_a_still_one_moves_where_others_see_through_it(tmp_path: Path) -> None:
+    # flow finds everything at rest, at depths of 1 m for a block and 2 m for the wall; later and earlier the
+    # wall is seen behind the block
+    view, middle, around = DenseView.of(Camera("cam0", 64, 48, 60.0, 60.0, 31.5, 23.5), 1.0), 40, (38, 40, 42)
+    workspace, config = Workspace(tmp_path, (view,), 81), RefinementConfig(stride=1)
+    workspace.prepare("test")
+    for name in ("first", "information", "prior", "prior_weight"):
+        workspace.create(name)
+    for name in ("fails", "held", LABELS, SIGHT):
+        workspace.create(name, np.uint8)
+    workspace.create(COLOUR, np.uint8, channels=(3,))
+    block = np.zeros(view.shape, bool)
+    block[14:34, 24:40] = True
+    for time in range(81):
+        here = block & (time in around)
+        workspace.write("first", (0, time), np.where(here, 0.0, -np.log(2.0)))
+        workspace.write("information", (0, time), np.full(view.shape, 1e6, np.float32))
+        workspace.write(COLOUR, (0, time), np.dstack([np.where(here, 200, 100), *[0 * here + 128] * 2]))
+        workspace.write("fails", (0, time), here)
+    rest, sure = np.zeros((*view.shape, 2), np.float32), np.ones(view.shape, np.float32)
+    for pair in (((0, 38), (0, 40)), ((0, 40), (0, 42))):
+        workspace.write_flow(*pair, FlowPair(rest, rest, sure, sure))
+    workspace.write_array("poses", np.tile(np.eye(4), (1, 81, 1, 1)))
+    neighbours: dict[Frame, tuple[Frame, ...]] = {(0, middle): ((0, 38), (0, 42))}
+    context = Context(workspace, ((0,),), neighbours, config, DisFlow(), FlowConfig())
+    edges = context.edges((0, middle), context.poses(), own_camera=True)
+    context.keep_flow_targets((0, middle), flow_targets(edges, block.size))
+
+    def moving() -> np.ndarray:
+        settle_task(context, (0, middle))
+        return np.asarray(workspace.read(LABELS, (0, middle))) > 0
+
+    assert not moving().any()  # flow alone proves it still
+    free_space_task(context, (0, middle))
+    sight = np.asarray(workspace.read(SIGHT, (0, middle)))
+    assert (sight[block] == SEEN_THROUGH).mean() > 0.9 and (sight[~block] == STANDS).mean() > 0.9
+    assert moving()[block].mean() > 0.9 and moving()[~block].mean() < 0.02
