@@ -198,10 +198,11 @@ def _what_moves(context: Context, frame: Frame) -> tuple[Labels, Mask]:
     residual = static_residual(np.exp(context.image("first", frame)), edges)
     explained = (residual < config.moving_px) & (own == 0)
     around = near & ~explained | (labels > 0)
-    # between things that move, their regions close over what stands there; a thing that moves evenly past the
-    # camera has the flow of a still one, through which others see
+    # between things that move, their regions close over what stands there; but what moves evenly past the
+    # camera has the flow of a still thing, too: where the static model fails others must see it stand
     seen = np.asarray(context.workspace.read(SIGHT, frame))
-    still = proven_still(residual, edges, config) & (seen != SEEN_THROUGH)
+    unlikely = (seen == SEEN_THROUGH) | (own > 0) & (seen != STANDS)
+    still = proven_still(residual, edges, config) & ~unlikely
     labels[still] = 0
     return labels, around & ~still
 

@@ -43,8 +43,8 @@ FARTHEST = 0.7
 """Log depth from the region's at most."""
 PRIOR, PRIOR_REACH = np.float32(0.1), np.float32(0.3)
 """Likeness that a plane loses at such a log depth from the region's, or farther."""
-ROUNDS, FIRST_GUESSES, GUESSES = 3, 8, 4
-"""Source: 3 and 5 rounds compared there, all within 2 %."""
+ROUNDS, FIRST_GUESSES, GUESSES = 2, 8, 4
+"""Source: 2, 3 and 5 rounds compared there, all within 2 %."""
 GUESS = 0.2
 """Log depth by which the first guesses of a round differ at most; every next one by half as much."""
 NEIGHBOURS = tuple((step * down, step * across) for step in (1, 3) for down, across in

@@ -132,7 +132,11 @@ def test_a_thing_with_the_flow_of_a_still_one_moves_where_others_see_through_it(
         settle_task(context, (0, middle))
         return np.asarray(workspace.read(LABELS, (0, middle))) > 0
 
-    assert not moving().any()  # flow alone proves it still
+    # flow proves it still where others see it stand
+    workspace.write(SIGHT, (0, middle), np.full(view.shape, STANDS, np.uint8))
+    assert not moving().any()
+    workspace.write(SIGHT, (0, middle), np.zeros(view.shape, np.uint8))
+    assert moving()[block].mean() > 0.9
     free_space_task(context, (0, middle))
     sight = np.asarray(workspace.read(SIGHT, (0, middle)))
     assert (sight[block] == SEEN_THROUGH).mean() > 0.9 and (sight[~block] == STANDS).mean() > 0.9

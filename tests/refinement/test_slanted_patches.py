@@ -72,7 +72,7 @@ def test_a_wall_that_slants_is_found_from_a_depth_that_is_off(slope: float) -> N
 
 
 def test_a_slanting_wall_is_found_better_than_by_a_sweep() -> None:
-    slope = -0.009
+    slope = -0.018
     image, truth = textured(3), np.log(wall(slope))
     other, jTi = seen_from_the_right(image, slope)
     found, _ = fitted(image, np.log(0.5), PatchView(other, VIEW.intrinsics, jTi, 1.0))
@@ -81,7 +81,7 @@ def test_a_slanting_wall_is_found_better_than_by_a_sweep() -> None:
     swept = np.full(SHAPE, np.nan, np.float32)
     swept[REGION] = swept_region(np.log(0.5), REGION, image[..., 0], VIEW.intrinsics, VIEW.rays, [view])
     seen = REGION & (np.arange(SHAPE[1]) - 70.0 * BASELINE * wall(slope) > 4.0)
-    assert np.abs(found - truth)[seen].mean() < 0.3 * np.abs(swept - truth)[seen].mean()
+    assert np.abs(found - truth)[seen].mean() < 0.4 * np.abs(swept - truth)[seen].mean()
 
 
 def test_likeness_is_the_weighted_correlation_of_patches() -> None:
