@@ -12,6 +12,7 @@ import numpy.typing as npt
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.refinement.depth import robust_cost
 from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, FlowTargets
+from mvdyn_gtsam.refinement.free_space import BEHIND
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 
 Mask = npt.NDArray[np.bool_]
@@ -23,6 +24,9 @@ SCORING_EDGES = 6
 STILL_VIEWS, STILL_SIDE = 2, 5
 """Frames that must see a pixel stand still, and side of the least square that does, px of the view. Source:
 as ``RefinementConfig.still_px``."""
+AROUND, NEAREST_SHARE = 8, 0.95
+"""Width of the rim of a moving region, px of the view, and the share of it that is not the nearest. Source:
+choice."""
 LEAST_PARALLAX_PX = 10.0
 """Motion of a pixel per unit of log depth below which its triangulated depth is no candidate."""
 
@@ -76,6 +80,22 @@ def proven_still(residual: Float32, edges: Sequence[Edge], config: RefinementCon
     still = (residual < config.still_px) & (views.reshape(residual.shape) >= STILL_VIEWS)
     kernel = np.ones((STILL_SIDE, STILL_SIDE), np.uint8)
     return np.asarray(cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0)
+
+
+def before_all_around(theta: Float32, labels: npt.NDArray[np.int32], known: Mask) -> Mask:
+    """``(h, w)`` where regions of ``labels (h, w)``, numbered from 1, are nearer than all around them.
+
+    By log inverse depth ``theta (h, w)``, which is ``known (h, w)`` for what stands around; everywhere in
+    regions around which it is not.
+    """
+    found = np.zeros(labels.shape, bool)
+    kernel = np.ones((2 * AROUND + 1, 2 * AROUND + 1), np.uint8)
+    for label in range(1, int(labels.max(initial=0)) + 1):
+        region = labels == label
+        rim = (cv2.dilate(region.astype(np.uint8), kernel) > 0) & (labels == 0) & known
+        limit = np.quantile(theta[rim], NEAREST_SHARE) + BEHIND if rim.any() else -np.inf
+        found |= region & (theta > limit)
+    return found
 
 
 def known_median(table: Float32) -> Float32:

@@ -33,6 +33,7 @@ from mvdyn_gtsam.refinement.free_space import (
 )
 from mvdyn_gtsam.refinement.ground import footing
 from mvdyn_gtsam.refinement.initial import (
+    before_all_around,
     carried_regions,
     closed,
     moving_regions,
@@ -199,9 +200,11 @@ def _what_moves(context: Context, frame: Frame) -> tuple[Labels, Mask]:
     explained = (residual < config.moving_px) & (own == 0)
     around = near & ~explained | (labels > 0)
     # between things that move, their regions close over what stands there; but what moves evenly past the
-    # camera has the flow of a still thing, too: where the static model fails others must see it stand
+    # camera has the flow of a still thing, too, so near that nothing else is
     seen = np.asarray(context.workspace.read(SIGHT, frame))
-    unlikely = (seen == SEEN_THROUGH) | (own > 0) & (seen != STANDS)
+    known = (context.trust(frame) > TRUSTED) & (own == 0)
+    nearest = before_all_around(context.image("first", frame), labels, known)
+    unlikely = (seen == SEEN_THROUGH) | (seen != STANDS) & nearest
     still = proven_still(residual, edges, config) & ~unlikely
     labels[still] = 0
     return labels, around & ~still

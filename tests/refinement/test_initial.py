@@ -14,6 +14,7 @@ from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, solve_frame
 from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, FlowTargets, flow_targets
 from mvdyn_gtsam.refinement.initial import (
     _triangulated,
+    before_all_around,
     best_candidate,
     carried_regions,
     failing_regions,
@@ -339,3 +340,18 @@ def test_edges_with_parallax_tell_most(scene: Scene, truth: Float32) -> None:
     # hardly trusted, it tells nothing however far apart the views are
     assert weak not in most_telling([*edges, weak], truth, 3)
     assert len(most_telling(edges, truth, 99)) == len(edges)
+
+
+def test_a_region_is_before_all_around_where_nothing_beside_it_is_as_near() -> None:
+    theta = np.full(VIEW.shape, -np.log(3.0), np.float32)
+    region, hole, gap = square(20, 30, 16), square(22, 32, 4), square(30, 40, 4)
+    theta[region] = -np.log(2.0)
+    theta[hole], theta[gap] = -np.log(0.3), -np.log(3.0)
+    labels, known = region.astype(np.int32), np.ones(VIEW.shape, bool)
+    np.testing.assert_array_equal(before_all_around(theta, labels, known), region & ~gap)
+    # the ground at its feet is as near as the thing
+    theta[36:, 25:51] = np.where(region, theta, -np.log(1.9))[36:, 25:51]
+    np.testing.assert_array_equal(before_all_around(theta, labels, known), hole)
+    # unknown depth beside it is no measure
+    known[:] = False
+    np.testing.assert_array_equal(before_all_around(theta, labels, known), region)
