@@ -85,6 +85,18 @@ class Planes:
         return Planes(self.theta[pixels], self.slope[pixels])
 
 
+@dataclass(frozen=True)
+class Fit:
+    """What is found at the ``N`` pixels of a region."""
+
+    theta: Float32
+    """``(N,)`` log inverse depth."""
+    slope: Float32
+    """``(N, 2)`` its change across and down, per px."""
+    likeness: Float32
+    """``(N,)`` how alike patches look there, at most 1."""
+
+
 def fitted_planes(
     theta: Float32,
     region: Mask,
@@ -92,9 +104,8 @@ def fitted_planes(
     intrinsics: Array,
     views: Sequence[PatchView],
     seed: tuple[int, ...],
-) -> tuple[Float32, Float32]:
-    """Log inverse depth ``(h, w)`` of ``region (h, w)`` that fits ``views`` best, and how alike its patches
-    look there, at most 1; NaN elsewhere.
+) -> Fit:
+    """The surface of ``region (h, w)`` that fits ``views`` best.
 
     The search begins at ``theta (h, w)``. Where no view sees the surface it finds nonsense: only what the
     searches of two cameras agree on is right. ``colour (h, w, C)`` is the image, ``intrinsics (3, 3)`` are
@@ -112,10 +123,8 @@ def fitted_planes(
         for guess in range(GUESSES):
             share = 0.5 ** (number + guess)
             search.guess(generator, GUESS * share, steepest, share)
-    found, alike = (np.full(region.shape, np.nan, np.float32) for _ in range(2))
-    found[region] = search.planes.of(cells.of_pixel).at(cells.offset).theta
-    alike[region] = search.likeness[cells.of_pixel]
-    return found, alike
+    planes = search.planes.of(cells.of_pixel).at(cells.offset)
+    return Fit(planes.theta, planes.slope, search.likeness[cells.of_pixel])
 
 
 class _Cells:

@@ -26,7 +26,7 @@ from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context, smooth_colou
 from mvdyn_gtsam.refinement.free_space import SIGHT
 from mvdyn_gtsam.refinement.growth import Growth
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
-from mvdyn_gtsam.refinement.moving_shape import ALIKE, FITTED
+from mvdyn_gtsam.refinement.moving_shape import FITTED
 from mvdyn_gtsam.refinement.neighbours import swept_times
 from mvdyn_gtsam.refinement.over_time import depth_of_regions
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
@@ -45,8 +45,8 @@ Array = npt.NDArray[np.float64]
 
 BYTES_PER_PIXEL_AND_PAIR = 10.0
 """Both directions of a flow on disk: two 16-bit numbers and a weight each."""
-BYTES_PER_PIXEL = 105.0
-"""Of a view on disk besides its flow: sixteen arrays of 32 bits, nine of 8, and where flow leads at about
+BYTES_PER_PIXEL = 113.0
+"""Of a view on disk besides its flow: eighteen arrays of 32 bits, nine of 8, and where flow leads at about
 eight other times."""
 WORKSPACE_FORMAT = 4
 """Raised when what lies on disk changes: a refinement that an earlier version began is begun anew."""
@@ -206,9 +206,10 @@ class Refinement:
         for name in (FAILS, CARRIED, SIGHT, "held"):
             workspace.create(name, np.uint8)
         workspace.create(LABELS, np.uint8)
+        workspace.create(FITTED, channels=(4,))
         for name in (
             "tracked", "tracked_confidence", "aligned", "swept", "instant", "prior", "prior_weight", "first",
-            "begun", "information", RELIEF, FITTED, ALIKE,
+            "begun", "information", RELIEF,
         ):  # fmt: skip
             workspace.create(name)
         for done, frame in enumerate(self._frames):

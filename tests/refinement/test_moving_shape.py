@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from mvdyn_gtsam.capture.model import Camera
-from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
+from mvdyn_gtsam.frontend.dense_flow import DisFlow, Float32, FlowConfig
 from mvdyn_gtsam.geometry import pixel_rays
 from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context
 from mvdyn_gtsam.refinement.moving_shape import (
     AGREES,
-    ALIKE,
     FITTED,
     FittedView,
     agreed_on,
@@ -30,6 +29,11 @@ REGION = np.zeros(SHAPE, bool)
 REGION[12:48, 20:60] = True
 LABELS_HERE = REGION.astype(np.int32)
 PLAIN = np.full((*SHAPE, 3), 100.0, np.float32)
+
+
+def flat(fitted: Float32) -> Float32:
+    """Planes that face the camera."""
+    return np.dstack([fitted, np.zeros((*fitted.shape, 2), np.float32)])
 
 
 def test_what_another_view_finds_there_is_agreed_on() -> None:
@@ -54,7 +58,7 @@ def test_depth_spreads_from_what_is_agreed_on_over_a_colour() -> None:
     fitted, agreed = np.full(SHAPE, np.nan, np.float32), REGION.copy()
     agreed[:, 30:] = False
     fitted[agreed] = np.log(0.5)
-    found = shaped(theta, LABELS_HERE, fitted, agreed, PLAIN)
+    found = shaped(theta, LABELS_HERE, flat(fitted), agreed, PLAIN)
     # three quarters of the region take five sixths of the way from 0.4
     np.testing.assert_allclose(found[REGION], np.log(0.5), atol=0.04)
     np.testing.assert_array_equal(found[~REGION], theta[~REGION])
@@ -68,7 +72,7 @@ def test_depth_does_not_spread_over_an_edge_of_the_image_nor_to_another_region()
     colour[:, 30:] = 200.0
     agreed = (labels == 1) & (np.arange(SHAPE[1]) < 30)
     fitted = np.where(agreed, np.float32(np.log(0.5)), np.nan).astype(np.float32)
-    found = shaped(theta, labels, fitted, agreed, colour)
+    found = shaped(theta, labels, flat(fitted), agreed, colour)
     np.testing.assert_allclose(found[agreed], np.log(0.5), atol=0.005)
     np.testing.assert_allclose(found[12:48, 30:40], np.log(0.4), atol=0.005)
     np.testing.assert_array_equal(found[labels == 2], theta[labels == 2])
@@ -79,15 +83,27 @@ def test_a_kink_is_kept_and_a_lone_error_is_not() -> None:
     roof = np.broadcast_to(np.log(0.5) - 0.004 * np.abs(columns - 40.0), SHAPE).astype(np.float32)
     fitted = np.where(REGION, roof, np.nan).astype(np.float32)
     fitted[30, 33] += 0.3
-    found = shaped(np.full(SHAPE, np.log(0.45), np.float32), LABELS_HERE, fitted, REGION, PLAIN)
+    found = shaped(np.full(SHAPE, np.log(0.45), np.float32), LABELS_HERE, flat(fitted), REGION, PLAIN)
     error = np.abs(found - roof)[REGION]
     assert error.mean() < 0.015 and error.max() < 0.03
+
+
+def test_what_slants_to_its_rim_does_so_with_the_slopes_that_are_agreed_on() -> None:
+    rows, columns = np.indices(SHAPE, np.float32)
+    truth = np.log(0.5) + 0.01 * columns - 0.005 * rows
+    fitted = np.where(REGION[..., None], np.dstack([truth, 0.01 + 0.0 * rows, -0.005 + 0.0 * rows]), np.nan)
+    start = np.full(SHAPE, np.log(0.6), np.float32)
+    alone, sloping = (
+        np.abs(shaped(start, LABELS_HERE, planes.astype(np.float32), REGION, PLAIN) - truth)[REGION]
+        for planes in (flat(fitted[..., 0]), fitted)
+    )
+    assert sloping.max() < 0.01 and alone.max() > 4.0 * sloping.max()
 
 
 def test_a_region_in_which_nothing_is_agreed_on_stays_as_it_was() -> None:
     rough = np.random.default_rng(0).normal(0.0, 0.1, SHAPE).astype(np.float32)
     nothing = np.zeros(SHAPE, bool)
-    np.testing.assert_array_equal(shaped(rough, LABELS_HERE, rough + 1.0, nothing, PLAIN), rough)
+    np.testing.assert_array_equal(shaped(rough, LABELS_HERE, flat(rough + 1.0), nothing, PLAIN), rough)
 
 
 def test_a_slanting_thing_that_two_cameras_see_gets_its_shape(tmp_path: Path) -> None:
@@ -96,9 +112,10 @@ def test_a_slanting_thing_that_two_cameras_see_gets_its_shape(tmp_path: Path) ->
     views = tuple(DenseView.of(Camera(f"cam{k}", 80, 60, 70.0, 70.0, 39.5, 29.5), 1.0) for k in range(2))
     workspace = Workspace(tmp_path, views, 1)
     workspace.prepare("test")
-    for name in ("prior", "begun", RELIEF, FITTED, ALIKE):
+    for name in ("prior", "begun", RELIEF):
         workspace.create(name)
     workspace.create(LABELS, np.uint8)
+    workspace.create(FITTED, channels=(4,))
     workspace.create(COLOUR, np.uint8, channels=(3,))
     image = textured()
     other, jTi = seen_from_the_right(image, slope)
