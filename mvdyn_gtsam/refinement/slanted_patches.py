@@ -47,8 +47,8 @@ ROUNDS, FIRST_GUESSES, GUESSES = 2, 8, 4
 """Source: 2, 3 and 5 rounds compared there, all within 2 %."""
 GUESS = 0.2
 """Log depth by which the first guesses of a round differ at most; every next one by half as much."""
-NEIGHBOURS = tuple((step * down, step * across) for step in (1, 3) for down, across in
-                   ((0, 1), (0, -1), (1, 0), (-1, 0)))  # fmt: skip
+NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0), (0, 3), (0, -3), (3, 0), (-3, 0))
+"""Cells down and across whose planes are tried."""
 
 
 @dataclass(frozen=True)
@@ -186,11 +186,10 @@ class _Search:
         self._patch = self._weight[..., None] * patch
         self._variance = np.einsum("msc,msc->m", self._patch, patch) + np.float32(NOISE**2)
         pixels = np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
-        self._views = [
-            (view, (view.intrinsics @ view.jTi[:3, :3] @ np.linalg.inv(intrinsics) @ pixels)
-             .astype(np.float32).reshape(3, *x.shape))
-            for view in views
-        ]  # fmt: skip
+        turned = [view.intrinsics @ view.jTi[:3, :3] @ np.linalg.inv(intrinsics) for view in views]
+        far = [(each @ pixels).astype(np.float32).reshape(3, *x.shape) for each in turned]
+        self._views = list(zip(views, far, strict=True))
+        """Each with where it sees what is infinitely far away in the patches, ``(3, M, S)`` homogeneous."""
         self._middle = np.float32(np.median(theta[region]))
         self.planes = Planes(theta[row, column].astype(np.float32), np.zeros((len(row), 2), np.float32))
         every = np.arange(len(row))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -69,75 +70,74 @@ def test_what_is_too_fast_for_flow_is_carried_from_the_next_frames(tmp_path: Pat
     assert not carried(0).any()
 
 
-def test_what_other_times_see_behind_a_thing_holds_the_depth_beside_it(tmp_path: Path) -> None:
-    # one camera that stands still before a wall 2 m away; in the middle frame a block, and flow that calls
-    # more than the block moving and settles nothing around
-    view, middle = DenseView.of(Camera("cam0", 64, 48, 60.0, 60.0, 31.5, 23.5), 1.0), (0, 12)
-    workspace, config = Workspace(tmp_path, (view,), 25), RefinementConfig(stride=1)
+VIEW = DenseView.of(Camera("cam0", 64, 48, 60.0, 60.0, 31.5, 23.5), 1.0)
+BLOCK = np.zeros(VIEW.shape, bool)
+BLOCK[14:34, 24:40] = True
+
+
+def block_before_a_wall(folder: Path, frames: int, times: Sequence[int], depth: float) -> Workspace:
+    """One camera that stands still before a dark wall 2 m away, well known.
+
+    At some ``times`` a bright block hides it, at the ``depth`` that its flow suggests.
+    """
+    workspace = Workspace(folder, (VIEW,), frames)
     workspace.prepare("test")
     for name in ("first", "information", "prior", "prior_weight"):
         workspace.create(name)
     for name in ("fails", "held", LABELS, SIGHT):
         workspace.create(name, np.uint8)
     workspace.create(COLOUR, np.uint8, channels=(3,))
-    block, fat = np.zeros(view.shape, bool), np.zeros(view.shape, bool)
-    block[14:34, 24:40], fat[12:36, 22:42] = True, True
-    for time in range(25):
-        here = block & (time == middle[1])
-        workspace.write("first", (0, time), np.full(view.shape, -np.log(2.0), np.float32))
-        workspace.write("information", (0, time), np.full(view.shape, 1e6, np.float32))
+    for time in range(frames):
+        here = BLOCK & (time in times)
+        workspace.write("first", (0, time), -np.log(np.where(here, depth, 2.0)))
+        workspace.write("information", (0, time), np.full(VIEW.shape, 1e6, np.float32))
         workspace.write(COLOUR, (0, time), np.dstack([np.where(here, 200, 100), *[0 * here + 128] * 2]))
+    workspace.write_array("poses", np.tile(np.eye(4), (1, frames, 1, 1)))
+    return workspace
+
+
+def test_what_other_times_see_behind_a_thing_holds_the_depth_beside_it(tmp_path: Path) -> None:
+    # in the middle frame flow calls more than the block moving, and settles nothing around
+    config, middle = RefinementConfig(stride=1), (0, 12)
+    workspace = block_before_a_wall(tmp_path, 25, (12,), 2.0)
+    fat = np.zeros(VIEW.shape, bool)
+    fat[12:36, 22:42] = True
     workspace.write("fails", middle, fat)
-    workspace.write_array("poses", np.tile(np.eye(4), (1, 25, 1, 1)))
     context = Context(workspace, ((0,),), {}, config, DisFlow(), FlowConfig())
-    context.keep_flow_targets(middle, flow_targets([], block.size))
+    context.keep_flow_targets(middle, flow_targets([], fat.size))
 
     settle_task(context, middle)
     found = np.asarray(workspace.read(LABELS, middle)) > 0
-    assert np.count_nonzero(found ^ block) <= 12
+    assert np.count_nonzero(found ^ BLOCK) <= 12
     beside = fat & ~found
     np.testing.assert_allclose(context.image("prior", middle)[beside], -np.log(2.0), atol=1e-3)
     np.testing.assert_allclose(context.image("prior_weight", middle)[beside], config.behind_sigma**-2)
 
 
 def test_a_thing_with_the_flow_of_a_still_one_moves_where_others_see_through_it(tmp_path: Path) -> None:
-    # flow finds everything at rest, at depths of 1 m for a block and 2 m for the wall; later and earlier the
-    # wall is seen behind the block
-    view, middle, around = DenseView.of(Camera("cam0", 64, 48, 60.0, 60.0, 31.5, 23.5), 1.0), 40, (38, 40, 42)
-    workspace, config = Workspace(tmp_path, (view,), 81), RefinementConfig(stride=1)
-    workspace.prepare("test")
-    for name in ("first", "information", "prior", "prior_weight"):
-        workspace.create(name)
-    for name in ("fails", "held", LABELS, SIGHT):
-        workspace.create(name, np.uint8)
-    workspace.create(COLOUR, np.uint8, channels=(3,))
-    block = np.zeros(view.shape, bool)
-    block[14:34, 24:40] = True
-    for time in range(81):
-        here = block & (time in around)
-        workspace.write("first", (0, time), np.where(here, 0.0, -np.log(2.0)))
-        workspace.write("information", (0, time), np.full(view.shape, 1e6, np.float32))
-        workspace.write(COLOUR, (0, time), np.dstack([np.where(here, 200, 100), *[0 * here + 128] * 2]))
-        workspace.write("fails", (0, time), here)
-    rest, sure = np.zeros((*view.shape, 2), np.float32), np.ones(view.shape, np.float32)
+    # flow finds the block at rest, 1 m away; later and earlier the wall is seen behind it
+    config, middle, around = RefinementConfig(stride=1), 40, (38, 40, 42)
+    workspace = block_before_a_wall(tmp_path, 81, around, 1.0)
+    for time in around:
+        workspace.write("fails", (0, time), BLOCK)
+    rest, sure = np.zeros((*VIEW.shape, 2), np.float32), np.ones(VIEW.shape, np.float32)
     for pair in (((0, 38), (0, 40)), ((0, 40), (0, 42))):
         workspace.write_flow(*pair, FlowPair(rest, rest, sure, sure))
-    workspace.write_array("poses", np.tile(np.eye(4), (1, 81, 1, 1)))
     neighbours: dict[Frame, tuple[Frame, ...]] = {(0, middle): ((0, 38), (0, 42))}
     context = Context(workspace, ((0,),), neighbours, config, DisFlow(), FlowConfig())
     edges = context.edges((0, middle), context.poses(), own_camera=True)
-    context.keep_flow_targets((0, middle), flow_targets(edges, block.size))
+    context.keep_flow_targets((0, middle), flow_targets(edges, BLOCK.size))
 
     def moving() -> np.ndarray:
         settle_task(context, (0, middle))
         return np.asarray(workspace.read(LABELS, (0, middle))) > 0
 
     # flow proves it still where others see it stand
-    workspace.write(SIGHT, (0, middle), np.full(view.shape, STANDS, np.uint8))
+    workspace.write(SIGHT, (0, middle), np.full(VIEW.shape, STANDS, np.uint8))
     assert not moving().any()
-    workspace.write(SIGHT, (0, middle), np.zeros(view.shape, np.uint8))
-    assert moving()[block].mean() > 0.9
+    workspace.write(SIGHT, (0, middle), np.zeros(VIEW.shape, np.uint8))
+    assert moving()[BLOCK].mean() > 0.9
     free_space_task(context, (0, middle))
     sight = np.asarray(workspace.read(SIGHT, (0, middle)))
-    assert (sight[block] == SEEN_THROUGH).mean() > 0.9 and (sight[~block] == STANDS).mean() > 0.9
-    assert moving()[block].mean() > 0.9 and moving()[~block].mean() < 0.02
+    assert (sight[BLOCK] == SEEN_THROUGH).mean() > 0.9 and (sight[~BLOCK] == STANDS).mean() > 0.9
+    assert moving()[BLOCK].mean() > 0.9 and moving()[~BLOCK].mean() < 0.02
