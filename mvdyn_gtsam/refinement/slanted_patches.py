@@ -198,7 +198,9 @@ class _Search:
     def take_from(self, own: Index, other: Index, offset: Float32) -> None:
         """Let pixels ``own (K,)`` take the planes of ``other (K,)``, ``offset (K, 2)`` px away, where those
         look more alike."""
-        self._offer(own, self.planes.of(other).at(offset))
+        # a small region has no cells so far apart
+        if len(own):
+            self._offer(own, self.planes.of(other).at(offset))
 
     def guess(
         self, generator: np.random.Generator, depth: float, steepest: float, share: float = 1.0

@@ -154,6 +154,15 @@ def test_without_a_view_or_texture_nothing_is_alike() -> None:
         assert np.isfinite(found[REGION]).all()
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (7, 1)])
+def test_a_region_of_few_pixels_at_the_rim(size: tuple[int, int]) -> None:
+    region, image = np.zeros(SHAPE, bool), textured()
+    region[: size[0], -size[1] :] = True
+    other, jTi = seen_from_the_right(image, 0.0)
+    found, _ = fitted(image, np.log(0.5), PatchView(other, VIEW.intrinsics, jTi, 1.0), region=region)
+    assert np.isfinite(found[region]).all()
+
+
 def test_the_same_seed_finds_the_same() -> None:
     image = textured()
     other, jTi = seen_from_the_right(image, 0.006)
