@@ -36,7 +36,7 @@ LEAST_ALIKE = 0.4
 cameras that see different sides of a person agree on nonsense."""
 AGREES = 0.02
 """Difference of log depths up to which two cameras agree. Source: 0.02, 0.03 and 0.05 compared there:
-each is better than the next by 1 to 3 %."""
+each is better than the next by 1 to 5 %."""
 AGREED, STAYS = np.float32(4.0), np.float32(0.05)
 """What it counts, beside ``TIE``, that a pixel lies where two cameras agree, and where it was."""
 TIE, CONTRAST, KINK = np.float32(200.0), 5.0, np.float32(0.02)
