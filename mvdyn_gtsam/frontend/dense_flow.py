@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol
 
 import cv2
@@ -218,8 +219,7 @@ def seeded_flow(
     residual = flow(grey_i, warped)
     # Pixel x looks like the warped image at x + residual, whose own seed is the one to add; NaN spreads.
     seed[unseen] = np.nan
-    raster += residual
-    composed = cv2.remap(seed, raster, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    composed = cv2.remap(seed, raster + residual, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     np.logical_or(unseen, np.isnan(composed[..., 0]), out=unseen)
     composed[unseen] = 0.0
     composed += residual
@@ -274,10 +274,17 @@ def inside(target: Float32, shape: tuple[int, ...], margin: float) -> npt.NDArra
 
 
 def pixel_raster(shape: tuple[int, ...]) -> Float32:
-    """``(H, W, 2)``: the x, y of every pixel."""
-    raster = np.empty((*shape[:2], 2), np.float32)
-    raster[..., 0] = np.arange(shape[1], dtype=np.float32)
-    raster[..., 1] = np.arange(shape[0], dtype=np.float32)[:, None]
+    """``(H, W, 2)``: the x, y of every pixel; not to be written to."""
+    return _raster(*shape[:2])
+
+
+# every pair of frames asks for it several times
+@lru_cache(maxsize=8)
+def _raster(height: int, width: int) -> Float32:
+    raster = np.empty((height, width, 2), np.float32)
+    raster[..., 0] = np.arange(width, dtype=np.float32)
+    raster[..., 1] = np.arange(height, dtype=np.float32)[:, None]
+    raster.setflags(write=False)
     return raster
 
 

@@ -269,11 +269,10 @@ def _correlations(
 def semi_global(cost: Float32, grey: npt.NDArray[np.uint8], config: SweepConfig) -> Float32:
     """Cost ``(h, w, D)`` summed over the cheapest paths from left, right, above and below."""
     luminance = grey.astype(np.float32)
-    turned, luminance_turned = np.ascontiguousarray(cost.transpose(1, 0, 2)), luminance.T
     total = _along_rows(cost, luminance, config)
-    total += _along_rows(cost[::-1], luminance[::-1], config)[::-1]
-    total += _along_rows(turned, luminance_turned, config).transpose(1, 0, 2)
-    total += _along_rows(turned[::-1], luminance_turned[::-1], config)[::-1].transpose(1, 0, 2)
+    total += _along_rows(np.ascontiguousarray(cost.transpose(1, 0, 2)), luminance.T, config).transpose(
+        1, 0, 2
+    )
     return total
 
 
@@ -297,21 +296,29 @@ def ladder_of(inverse_depths: npt.NDArray[np.floating], levels: int) -> Float32:
 
 
 def _along_rows(cost: Float32, luminance: Float32, config: SweepConfig) -> Float32:
-    """Cheapest cost ``(h, w, D)`` of paths that run down from the first row."""
+    """Cost ``(h, w, D)`` summed over the cheapest paths that run down from the first row and up from the
+    last."""
     small, large = np.float32(config.small_step), np.float32(config.large_step)
-    result = np.empty(cost.shape, np.float32)
-    result[0] = cost[0]
-    padded = np.full((cost.shape[1], cost.shape[2] + 2), FORBIDDEN)
-    for row in range(1, len(cost)):
-        previous = result[row - 1]
-        lowest_previous = previous.min(axis=1, keepdims=True)
-        contrast = np.abs(luminance[row] - luminance[row - 1])
-        jump = small + (large - small) * np.exp(contrast / np.float32(-config.edge_contrast))
-        padded[:, 1:-1] = previous
-        best = np.minimum(padded[:, :-2], padded[:, 2:])
-        best += small
-        np.minimum(best, previous, out=best)
-        np.minimum(best, lowest_previous + jump[:, None], out=best)
-        best -= lowest_previous
-        np.add(cost[row], best, out=result[row])
-    return result
+    contrast = np.abs(np.diff(luminance, axis=0))
+    jump = small + (large - small) * np.exp(contrast / np.float32(-config.edge_contrast))
+    height, width, levels = cost.shape
+    total = np.zeros(cost.shape, np.float32)
+    # both ways in one array: half the calls, which are what small images take time for
+    cheapest = np.stack([cost[0], cost[-1]])
+    padded = np.full((2, width, levels + 2), FORBIDDEN)
+    for row in range(height):
+        down, up = row, height - 1 - row
+        if row > 0:
+            previous, lowest_previous = cheapest, cheapest.min(axis=2, keepdims=True)
+            padded[..., 1:-1] = previous
+            cheapest = np.minimum(padded[..., :-2], padded[..., 2:])
+            cheapest += small
+            np.minimum(cheapest, previous, out=cheapest)
+            jumped = lowest_previous + np.stack([jump[down - 1], jump[up]])[..., None]
+            np.minimum(cheapest, jumped, out=cheapest)
+            cheapest -= lowest_previous
+            cheapest[0] += cost[down]
+            cheapest[1] += cost[up]
+        total[down] += cheapest[0]
+        total[up] += cheapest[1]
+    return total

@@ -85,8 +85,8 @@ def sight(theta: Float32, rays: Float32, views: Sequence[DepthView]) -> Sight:
     """What views see of points at log inverse depth ``theta (M,)`` along ``rays (M, 3)``."""
     through, there = (np.zeros(len(theta), np.int32) for _ in range(2))
     for view in views:
-        farther, (row, column) = depth_beyond(theta, rays, view)
-        told = view.trust[row, column] > TRUSTED
+        farther, pixel = depth_beyond(theta, rays, view)
+        told = view.trust.ravel()[pixel] > TRUSTED
         through += told & (farther > BEHIND)
         there += told & (np.abs(farther) < AGREES)
     return Sight(through, there)
@@ -98,19 +98,20 @@ def without_outlines(mask: Mask) -> Mask:
     return np.asarray(cv2.medianBlur(mask.astype(np.uint8), 5) > 0)
 
 
-def depth_beyond(
-    theta: Float32, rays: Float32, view: SeeingView
-) -> tuple[Float32, tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
+def depth_beyond(theta: Float32, rays: Float32, view: SeeingView) -> tuple[Float32, npt.NDArray[np.int32]]:
     """``(M,)`` log of the depth that a view sees over that of the points in it, NaN outside of it.
 
-    Also the row and column of the view's pixels; any outside. ``theta (M,)`` is log inverse depth along
+    Also the flat index ``(M,)`` of the view's pixels; any outside. ``theta (M,)`` is log inverse depth along
     ``rays (M, 3)``.
     """
     inverse_depth = np.exp(theta)
     at, front = pixels_seen(inverse_depth, rays, view.jTi, view.intrinsics)
     height, width = view.theta.shape
-    inside = front & (at >= -0.5).all(axis=1) & (at[:, 0] < width - 0.5) & (at[:, 1] < height - 0.5)
-    column, row = np.rint(np.where(inside[:, None], at, 0.0)).astype(np.int64).T
+    x, y = at.T
+    inside = front & (x >= -0.5) & (y >= -0.5)
+    inside &= (x < width - 0.5) & (y < height - 0.5)
+    column, row = (np.rint(np.where(inside, axis, np.float32(0.0))).astype(np.int32) for axis in (x, y))
+    pixel = row * np.int32(width) + column
     depth_ratio = rays @ view.jTi[2, :3].astype(np.float32) + inverse_depth * np.float32(view.jTi[2, 3])
-    farther = theta - view.theta[row, column] - np.log(np.where(inside, depth_ratio, 1.0))
-    return np.where(inside, farther, np.float32(np.nan)).astype(np.float32), (row, column)
+    farther = theta - view.theta.ravel()[pixel] - np.log(np.where(inside, depth_ratio, np.float32(1.0)))
+    return np.where(inside, farther, np.float32(np.nan)), pixel

@@ -4,6 +4,7 @@ best, and for what moves a depth from the views of its instant."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -103,9 +104,40 @@ def known_median(table: Float32) -> Float32:
     if not len(table):
         return np.full(table.shape[1:], np.nan, np.float32)
     # no nanmedian: it warns where all are NaN, and these sort to the end
-    table = np.sort(table, axis=0)
-    middle = np.maximum(np.isfinite(table).sum(axis=0) - 1, 0) // 2
-    return np.take_along_axis(table, middle[None], axis=0)[0]
+    known = np.isfinite(table).reshape(len(table), -1)
+    values = sorted_rows(np.fmin(table.reshape(known.shape), np.float32(np.inf)))
+    count = known.sum(axis=0, dtype=np.int32)
+    middle = np.maximum(count - 1, 0) // 2
+    median = values.ravel().take(middle * np.int64(values.shape[1]) + np.arange(values.shape[1]))
+    return np.where(count > 0, median, np.float32(np.nan)).reshape(table.shape[1:])
+
+
+def sorted_rows(table: Float32) -> Float32:
+    """``table (K, ...)`` without NaN, sorted along the first axis; ``table`` is spent.
+
+    Whole rows are compared, by Batcher's network of exchanges (https://doi.org/10.1145/1468075.1468121): for
+    a dozen rows in half the time of ``np.sort``.
+    """
+    for low, high in exchanges(len(table)):
+        least = np.minimum(table[low], table[high])
+        np.maximum(table[low], table[high], out=table[high])
+        table[low] = least
+    return table
+
+
+@lru_cache(maxsize=64)
+def exchanges(count: int) -> tuple[tuple[int, int], ...]:
+    """Pairs of rows that Batcher's odd-even merge sort of ``count`` rows compares, in order."""
+    pairs = []
+    for level in range(count.bit_length()):
+        span = 2**level
+        for part in range(level, -1, -1):
+            step = 2**part
+            for first in range(step % span, count - step, 2 * step):
+                for low in range(first, min(first + step, count - step)):
+                    if low // (2 * span) == (low + step) // (2 * span):
+                        pairs.append((low, low + step))
+    return tuple(pairs)
 
 
 def failing_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[np.uint8]:

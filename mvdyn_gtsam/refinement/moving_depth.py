@@ -136,8 +136,8 @@ def _seen_by(views: Sequence[InstantView], theta: Float32, rays: Float32) -> Ite
     """Per view how much farther than the points, ``(M,)`` as ``depth_beyond`` says, it sees a still surface,
     and whether something moves ``(M,)`` there."""
     for view in views:
-        farther, (row, column) = depth_beyond(theta, rays, view)
-        yield farther, view.moves[row, column]
+        farther, pixel = depth_beyond(theta, rays, view)
+        yield farther, view.moves.ravel()[pixel]
 
 
 def commonest(values: Float32) -> float:

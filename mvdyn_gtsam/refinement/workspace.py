@@ -68,6 +68,7 @@ class Workspace:
     def __init__(self, folder: Path, views: tuple[DenseView, ...], frame_count: int) -> None:
         self.folder, self.views, self.frame_count = folder, views, frame_count
         self._layouts: dict[Path, _Layout] = {}
+        self._arrays: dict[str, tuple[tuple[int, int], npt.NDArray[np.float64]]] = {}
 
     def prepare(self, settings: str) -> None:
         """Make the folder, or keep what an earlier run with the same ``settings`` left in it.
@@ -145,8 +146,16 @@ class Workspace:
             temporary.replace(path)
 
     def read_array(self, name: str) -> npt.NDArray[np.float64]:
-        """What ``write_array`` kept."""
-        return np.asarray(np.load(self.folder / f"{name}.npy"))
+        """What ``write_array`` kept; not to be written to."""
+        path = self.folder / f"{name}.npy"
+        state = path.stat()
+        # every write makes a new file: most tasks ask for the poses, which seldom change
+        version = (state.st_ino, state.st_mtime_ns)
+        if name not in self._arrays or self._arrays[name][0] != version:
+            array = np.asarray(np.load(path))
+            array.setflags(write=False)
+            self._arrays[name] = (version, array)
+        return self._arrays[name][1]
 
     def _layout(self, path: Path) -> _Layout:
         """Where the images of an array lie; its header is parsed once, not with every image."""
