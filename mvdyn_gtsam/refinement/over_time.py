@@ -50,6 +50,10 @@ LEAST_WEIGHT = 1e-5
 FEET_OUTSIDE = 0.02
 """Evidence of the ground at the border for a thing that reaches out of the image; of that below feet it is 1.
 Source: choice."""
+NEARER = 0.1
+"""By how much nearer, in log depth, than the ground at the border a thing that reaches out of the image there
+is at least if no other camera sees it: its feet are farther down. Source: 0 to 0.2 compared on six rendered
+and four generated scenes: 0 is worse by 3 %, 0.05 to 0.15 within 1 %."""
 ITERATIONS = 10
 STILL_STEPS = 5
 """Frames before and after that have a say in whether a thing stands still. Source: choice; frames that differ
@@ -97,6 +101,7 @@ def depth_of_regions(
             if one.first in number and one.second in number
         ]
         solved, belief = smooth_over_time(regions_found, sorted(links), growths)
+        solved = np.maximum(solved, ground_at_border(regions_found))
         ground = on_the_ground(regions_found, sorted(links), growths)
         for region, stands, theta, believed, below in zip(
             regions_found, still, solved, belief, ground, strict=True
@@ -217,12 +222,18 @@ def on_the_ground(
         for region in regions
     ]
     solved, belief = smooth_over_time(standing, links, growths)
-    # whose feet are outside stands there or nearer
-    least = [
-        -np.inf if region.footing is None or region.footing.feet_seen else region.footing.log_inverse_depth
-        for region in regions
-    ]
-    return np.where(belief > 0.0, np.maximum(solved, least), np.nan)
+    return np.where(belief > 0.0, np.maximum(solved, ground_at_border(regions)), np.nan)
+
+
+def ground_at_border(regions: Sequence[RegionDepth]) -> Array:
+    """``(N,)`` the least log inverse depth of ``regions``: those whose feet are outside of the image stand on
+    the ground at its border or nearer. Minus infinity for others."""
+    least = np.full(len(regions), -np.inf)
+    for number, region in enumerate(regions):
+        if region.footing is not None and not region.footing.feet_seen:
+            seen = region.evidence > SEEN
+            least[number] = region.footing.log_inverse_depth + (0.0 if seen else NEARER)
+    return least
 
 
 def _evenness(links: Sequence[Link], count: int) -> sparse.csr_array:
