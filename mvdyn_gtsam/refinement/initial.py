@@ -4,7 +4,6 @@ best, and for what moves a depth from the views of its instant."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -14,6 +13,7 @@ from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.refinement.depth import robust_cost
 from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, FlowTargets
 from mvdyn_gtsam.refinement.free_space import BEHIND
+from mvdyn_gtsam.refinement.medians import known_median
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 
 Mask = npt.NDArray[np.bool_]
@@ -97,47 +97,6 @@ def before_all_around(theta: Float32, labels: npt.NDArray[np.int32], known: Mask
         limit = np.quantile(theta[rim], NEAREST_SHARE) + BEHIND if rim.any() else -np.inf
         found |= region & (theta > limit)
     return found
-
-
-def known_median(table: Float32) -> Float32:
-    """Lower median ``(...)`` of ``table (K, ...)`` over the first axis without its NaN; NaN where all are."""
-    if not len(table):
-        return np.full(table.shape[1:], np.nan, np.float32)
-    # no nanmedian: it warns where all are NaN, and these sort to the end
-    known = np.isfinite(table).reshape(len(table), -1)
-    values = sorted_rows(np.fmin(table.reshape(known.shape), np.float32(np.inf)))
-    count = known.sum(axis=0, dtype=np.int32)
-    middle = np.maximum(count - 1, 0) // 2
-    median = values.ravel().take(middle * np.int64(values.shape[1]) + np.arange(values.shape[1]))
-    return np.where(count > 0, median, np.float32(np.nan)).reshape(table.shape[1:])
-
-
-def sorted_rows(table: Float32) -> Float32:
-    """``table (K, ...)`` without NaN, sorted along the first axis; ``table`` is spent.
-
-    Whole rows are compared, by Batcher's network of exchanges (https://doi.org/10.1145/1468075.1468121): for
-    a dozen rows in half the time of ``np.sort``.
-    """
-    for low, high in exchanges(len(table)):
-        least = np.minimum(table[low], table[high])
-        np.maximum(table[low], table[high], out=table[high])
-        table[low] = least
-    return table
-
-
-@lru_cache(maxsize=64)
-def exchanges(count: int) -> tuple[tuple[int, int], ...]:
-    """Pairs of rows that Batcher's odd-even merge sort of ``count`` rows compares, in order."""
-    pairs = []
-    for level in range(count.bit_length()):
-        span = 2**level
-        for part in range(level, -1, -1):
-            step = 2**part
-            for first in range(step % span, count - step, 2 * step):
-                for low in range(first, min(first + step, count - step)):
-                    if low // (2 * span) == (low + step) // (2 * span):
-                        pairs.append((low, low + step))
-    return tuple(pairs)
 
 
 def failing_regions(residual: Float32, config: RefinementConfig) -> npt.NDArray[np.uint8]:

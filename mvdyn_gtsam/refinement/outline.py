@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.geometry import invert_pose
-from mvdyn_gtsam.refinement.initial import known_median
 from mvdyn_gtsam.refinement.lattice import Lattice, lattice_solution, neighbour_likeness
+from mvdyn_gtsam.refinement.medians import known_median
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import pixels_seen
 

@@ -47,6 +47,10 @@ FADING_STEPS = 24.0
 """Frames after which another frame's evidence counts 1/e."""
 LEAST_WEIGHT = 1e-5
 """Of an observation without evidence: a region that nothing else tells of keeps it. Source: choice."""
+FEET, FEET_SCATTER = 0.3, 0.1
+"""Evidence of the ground below feet where images have no more than ``SEEN``, and its common error. Source:
+0.1 to 1 compared on six rendered and eight generated scenes: without it people that nobody else sees are
+worse by up to two fifths, all on the mean by 3 %; the rest within 1 %."""
 FEET_OUTSIDE = 0.02
 """Evidence of the ground at the border for a thing that reaches out of the image; of that below feet it is 1.
 Source: choice."""
@@ -159,25 +163,26 @@ def smooth_over_time(
     ``links`` are pairs of their numbers in consecutive frames and whether they are one thing, ``growths``
     pairs of any two frames with the log growth from the first to the second and its standard deviation.
     Robust least squares: an observation counts by its evidence, and less the more the others contradict it.
+    What images do not tell the ground below its feet does, but is no evidence that it moves.
     """
     count = len(regions)
-    observed = np.array([region.log_inverse_depth for region in regions])
-    evidence = np.array([region.evidence for region in regions])
+    observed, evidence, scatter, by_images = _observations(regions)
     change = _differences([(a, b) for a, b, _, _ in growths], count)
     growth, sigma = np.array([pair[2:] for pair in growths]).reshape(-1, 2).T
     stiffness = _evenness(links, count)
     solved, weight, sure = observed, evidence, sigma**-2
     for _ in range(ITERATIONS):
         # without any evidence a region keeps what it saw
-        data = np.maximum(weight, LEAST_WEIGHT) / SCATTER**2
+        data = np.maximum(weight, LEAST_WEIGHT) / scatter**2
         grown = change.T @ (change * sure[:, None])
         matrix = sparse.csc_array(stiffness + grown + sparse.diags_array(data))
         solved = spsolve(matrix, data * observed + change.T @ (sure * growth))
-        weight = evidence / (1.0 + ((solved - observed) / SCATTER) ** 2)
+        weight = evidence / (1.0 + ((solved - observed) / scatter) ** 2)
         sure = sigma**-2 / (1.0 + ((change @ solved - growth) / sigma) ** 2)
     group = connected_components(sparse.csr_array(stiffness + change.T @ change), directed=False)[1]
     times = np.array([region.frame[1] for region in regions], dtype=np.float64)
     solved = np.asarray(solved).reshape(count).copy()
+    weight = np.where(by_images, weight, 0.0)
     belief, measured = np.zeros(count), grown.diagonal() > 0.0
     for number in np.unique(group):
         same = np.flatnonzero(group == number)
@@ -187,6 +192,18 @@ def smooth_over_time(
             # motion that goes on evenly would leave the scene
             solved[unmeasured] = np.clip(solved[unmeasured], seen.min() - FARTHEST, seen.max() + FARTHEST)
     return solved, belief
+
+
+def _observations(regions: Sequence[RegionDepth]) -> tuple[Array, Array, Array, Mask]:
+    """Log inverse depth, its evidence, its common error, and whether images tell it, ``(N,)`` each."""
+    rows = [
+        (region.footing.log_inverse_depth, FEET, FEET_SCATTER, False)
+        if region.footing is not None and region.footing.feet_seen and region.evidence <= SEEN
+        else (region.log_inverse_depth, region.evidence, SCATTER, True)
+        for region in regions
+    ]
+    observed, evidence, scatter, by_images = np.array(rows, dtype=np.float64).reshape(-1, 4).T
+    return observed, evidence, scatter, by_images > 0.0
 
 
 def strongest_around(evidence: Array, times: Array) -> Array:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mvdyn_gtsam.refinement.ground import Footing, footing
 from mvdyn_gtsam.refinement.moving_depth import RegionDepth
-from mvdyn_gtsam.refinement.over_time import Link, on_the_ground
+from mvdyn_gtsam.refinement.over_time import NEARER, Link, ground_at_border, on_the_ground, smooth_over_time
 
 
 def floor_and_wall() -> np.ndarray:
@@ -63,9 +65,40 @@ def test_where_it_stood_before_tells_where_it_stands_without_feet() -> None:
     np.testing.assert_allclose(found, 0.02 * np.arange(25), atol=0.01)
 
 
-def test_a_thing_without_feet_is_at_least_as_near_as_the_border() -> None:
+def test_a_thing_without_feet_is_nearer_than_the_border() -> None:
     regions, links, growths = walking([False] * 5)
-    assert (on_the_ground(regions, links, growths) >= 0.0).all()
+    assert (on_the_ground(regions, links, growths) >= NEARER).all()
+
+
+def test_where_images_tell_a_depth_the_border_only_bounds_it() -> None:
+    outside, inside = Footing(0.5, False), Footing(0.5, True)
+    regions = [
+        RegionDepth((0, 0), label, 0.0, evidence, footing=footing)
+        for label, (evidence, footing) in enumerate(
+            [(1.0, outside), (0.0, outside), (1.0, inside), (0.0, None)]
+        )
+    ]
+    np.testing.assert_allclose(ground_at_border(regions), [0.5, 0.5 + NEARER, -np.inf, -np.inf])
+
+
+def test_feet_tell_the_depth_that_images_do_not() -> None:
+    """Others saw it wrongly, 0.3 too near, before it left their view; its feet are on the ground."""
+    wrong = [RegionDepth((0, t), 1, 0.3, 0.5 if t < 3 else 0.0) for t in range(20)]
+    standing = [replace(region, footing=Footing(0.0, True)) for region in wrong]
+    links = [(t, t + 1, True) for t in range(19)]
+    (without, _), (found, belief) = (smooth_over_time(each, links) for each in (wrong, standing))
+    assert without[10:] == pytest.approx(0.3, abs=0.02)
+    assert found[10:] == pytest.approx(0.0, abs=0.05)
+    # that it moves images must say
+    assert smooth_over_time([replace(one, evidence=0.0) for one in standing], links)[1].max() == 0.0
+    assert belief[0] > 0.0
+
+
+def test_feet_have_no_say_where_images_tell() -> None:
+    """A thing that hovers, or flies."""
+    hovering = [RegionDepth((0, t), 1, 0.3, 0.5, footing=Footing(0.0, True)) for t in range(5)]
+    solved, _ = smooth_over_time(hovering, [(t, t + 1, True) for t in range(4)])
+    np.testing.assert_allclose(solved, 0.3, atol=1e-6)
 
 
 def test_what_never_touches_the_ground_is_nowhere() -> None:

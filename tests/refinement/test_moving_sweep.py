@@ -104,6 +104,18 @@ def test_what_looks_too_little_alike_stays_where_it_is() -> None:
     assert (np.abs(found - NEAR) < PRIOR_REACH).mean() > 0.8
 
 
+def test_what_the_view_would_not_see_is_not_drawn_into_it() -> None:
+    """At its depth it lies left of the other image, in which something else looks a little like it."""
+    grey, jTi = textured(), np.eye(4)
+    jTi[0, 3] = -2.0
+    farther = NEAR - 0.4
+    alike = np.roll(grey, -round(70.0 * 2.0 * np.exp(farther)), axis=1)
+    image = (0.4 * alike + 0.9 * textured(1)).astype(np.float32)
+    wall = np.full(SHAPE, np.log(0.1), np.float32)
+    found = swept(NEAR, grey, InstantView(image, INTRINSICS, jTi, wall, EVERYWHERE, wall))
+    assert (np.abs(found - NEAR) < 0.1).mean() > 0.95
+
+
 def test_what_a_view_sees_from_the_side_is_nearer_than_its_middle() -> None:
     """No texture: the region stays at its depth but for half of the way to the front of its hull."""
     pillar = np.zeros(SHAPE, bool)

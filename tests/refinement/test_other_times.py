@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvdyn_gtsam.refinement.initial import known_median
+from mvdyn_gtsam.refinement.medians import known_median
 from mvdyn_gtsam.refinement.other_times import (
     AROUND,
     LIKELIER,

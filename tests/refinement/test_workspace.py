@@ -209,6 +209,15 @@ def test_arrays_are_replaced_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     np.testing.assert_array_equal(kept.read_array("poses"), 2.0 * np.eye(4))
 
 
+def test_an_array_is_read_anew_once_another_process_wrote_it(tmp_path: Path) -> None:
+    kept, other = workspace(tmp_path), workspace(tmp_path)
+    kept.write_array("poses", np.eye(4))
+    read = kept.read_array("poses")
+    assert kept.read_array("poses") is read and not read.flags.writeable
+    other.write_array("poses", 2.0 * np.eye(4))
+    np.testing.assert_array_equal(kept.read_array("poses"), 2.0 * np.eye(4))
+
+
 def test_finished_steps_are_known_to_the_next_run(tmp_path: Path) -> None:
     kept = workspace(tmp_path)
     assert kept.finished() == []
