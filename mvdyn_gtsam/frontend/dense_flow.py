@@ -279,7 +279,7 @@ def pixel_raster(shape: tuple[int, ...]) -> Float32:
 
 
 # every pair of frames asks for it several times
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=4)
 def _raster(height: int, width: int) -> Float32:
     raster = np.empty((height, width, 2), np.float32)
     raster[..., 0] = np.arange(width, dtype=np.float32)
