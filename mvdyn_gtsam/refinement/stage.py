@@ -57,7 +57,7 @@ CARRY_ROUNDS = 4
 on five rendered scenes."""
 SECONDS_PER_MEGAPIXEL = 0.25
 """One flow pair on one processor, per million pixels of the input. Source: the six captures of
-experiments/results/refinement_phases.json, 0.24 to 0.28."""
+experiments/results/refinement_phases.json, 0.24 to 0.27."""
 
 
 @dataclass(frozen=True)
