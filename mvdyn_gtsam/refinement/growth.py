@@ -39,7 +39,7 @@ WORST_CONDITION = 1e9
 SIGMA = 0.03
 """Standard deviation of the log growth at best: limbs swing, things turn, and what turns or leaves the image
 errs alike from frame to frame, so that many frames know little more than one. Source: 0.01 to 0.1 compared on
-six rendered and four generated scenes: regions' depth is worse by 18 % with 0.01, within 5 % from 0.02 to
+five rendered and four generated scenes: regions' depth is worse by 18 % with 0.01, within 6 % from 0.02 to
 0.06."""
 
 Region = tuple[Frame, int]

@@ -29,9 +29,9 @@ SWEEP = SweepConfig(window=PATCH, unseen=np.nan, small_step=2.0, large_step=100.
 scenes: each patch alone is right within 5 % for a third to two thirds of the pixels only."""
 UNSEEN = np.float32(0.3)
 """How alike patches with texture are at some wrong depth by chance, which is what a depth gets from a view
-that would not see it. Source: 0 to 0.5 compared on six rendered and four generated scenes, 0.2 to 0.35 within
-3 %; with 0 people whom no other camera saw were taken for others, twice as near, and moving depth was worse
-by a tenth."""
+that would not see it. Source: 0 to 0.5 compared on five rendered and four generated scenes, 0.2 to 0.35
+within 3 %; with 0 people whom no other camera saw were taken for others, twice as near, and moving depth was
+worse by a tenth."""
 SAY = np.float32(4.5)
 """Of how alike patches are. Source: 2, 3 and 4.5 compared there, within 3 %. On the first four 6 told two
 things that meet apart better, by 4 %, and an arm of few colours was worse by 15 %."""

@@ -314,7 +314,7 @@ def _fitted(
 
 def _share(planes: Array, rays: Array, inverse_depth: Array, trust: Array, config: PlainConfig) -> Array:
     """``(N,)`` of the points' trust that each of ``planes (N, 3)`` explains."""
-    # single precision decides the same but at the very tolerance, in a third of the time
+    # in single precision, which decides the same but at the very tolerance
     seen, share = (rays / inverse_depth[:, None]).astype(np.float32), (trust / trust.sum()).astype(np.float32)
     error = planes.astype(np.float32) @ seen.T
     error -= np.float32(1.0)

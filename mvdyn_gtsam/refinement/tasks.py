@@ -149,25 +149,23 @@ def window_task(context: Context, window: tuple[str, str, int, int, int]) -> Non
     workspace, config = context.workspace, context.config
     wTc = context.poses()
     times = range(max(0, first - config.overlap), min(workspace.frame_count, end + config.overlap))
-    # the newest depth of every frame that was asked for
-    newest: dict[Frame, Float32] = {}
-
-    def theta_of(j: Frame) -> Float32:
-        if j not in newest:
-            newest[j] = np.log(context.image(source, j))
-        return newest[j]
-
+    renewed: dict[Frame, Float32] = {}
     for group in context.groups:
         for frame in ((camera, time) for time in times for camera in group):
             moves = workspace.read("moving", frame) != STATIC
             sparse = context.edges(frame, wTc, own_camera=False, among=context.raster(frame, CHECK_SPACING))
             telling = most_telling(sparse, context.image(source, frame), config.edges_per_frame)
             edges = _edges_of(context, frame, [edge.j for edge in telling], moves, wTc)
-            others = {edge.j: theta_of(edge.j) for edge in edges}
+            others = {
+                edge.j: renewed[edge.j] if edge.j in renewed else np.log(context.image(source, edge.j))
+                for edge in edges
+            }
             prior = DepthPrior(context.image("prior", frame), context.image("prior_weight", frame))
-            problem = FrameProblem(edges, others, _image_weights(context, frame), prior, config)
-            theta, information = solve_frame(theta_of(frame), problem, steps)
-            newest[frame] = theta
+            theta, weights = np.log(context.image(source, frame)), _image_weights(context, frame)
+            theta, information = solve_frame(
+                theta, FrameProblem(edges, others, weights, prior, config), steps
+            )
+            renewed[frame] = theta
             if first <= frame[1] < end:
                 workspace.write(target, frame, np.exp(theta))
                 workspace.write("information", frame, information)
