@@ -269,10 +269,9 @@ def _correlations(
 def semi_global(cost: Float32, grey: npt.NDArray[np.uint8], config: SweepConfig) -> Float32:
     """Cost ``(h, w, D)`` summed over the cheapest paths from left, right, above and below."""
     luminance = grey.astype(np.float32)
+    turned = np.ascontiguousarray(cost.transpose(1, 0, 2))
     total = _along_rows(cost, luminance, config)
-    total += _along_rows(np.ascontiguousarray(cost.transpose(1, 0, 2)), luminance.T, config).transpose(
-        1, 0, 2
-    )
+    total += _along_rows(turned, luminance.T, config).transpose(1, 0, 2)
     return total
 
 
