@@ -22,6 +22,9 @@ TRUSTED_SIGMA = 0.05
 """Standard deviation of log depth at which a pixel's depth counts half as its own and half as its
 surroundings'."""
 
+CHECK_SPACING = 8
+"""Distance of the pixels that choose edges and whose residuals are compared, px of the input."""
+
 STATIC, MOVING, UNEXPLAINED = 0, 1, 2
 """Of the array ``moving``: nothing moves; it moves and the views of its instant tell its depth; they do
 not."""

@@ -13,7 +13,7 @@ from mvdyn_gtsam.frontend.dense_flow import Float32, pixel_raster
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import is_first
-from mvdyn_gtsam.refinement.residuals import FlowTerms, turned_flow_terms, turned_rays
+from mvdyn_gtsam.refinement.solve.residuals import FlowTerms, turned_flow_terms, turned_rays
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
-from mvdyn_gtsam.refinement.depth import robust_cost
 from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, FlowTargets
-from mvdyn_gtsam.refinement.free_space import BEHIND
 from mvdyn_gtsam.refinement.medians import known_median
+from mvdyn_gtsam.refinement.moving.free_space import BEHIND
 from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.solve.depth import robust_cost
 
 Mask = npt.NDArray[np.bool_]
 

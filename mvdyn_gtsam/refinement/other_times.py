@@ -19,10 +19,10 @@ from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.context import TRUSTED_SIGMA, Context, trust_of
 from mvdyn_gtsam.refinement.initial import closed, regions
-from mvdyn_gtsam.refinement.local_planes import on_local_planes
 from mvdyn_gtsam.refinement.medians import known_median
 from mvdyn_gtsam.refinement.neighbours import times_in_view
 from mvdyn_gtsam.refinement.patches import Picture, PictureView, contrast, likeness
+from mvdyn_gtsam.refinement.plain.local_planes import on_local_planes
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mvdyn_gtsam.refinement.tasks import FinishedFrame
+from mvdyn_gtsam.refinement.finish import FinishedFrame
 
 
 class SelfCheck:

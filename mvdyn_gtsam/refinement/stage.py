@@ -20,22 +20,24 @@ import numpy.typing as npt
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, Float32, FlowConfig, to_grey
 from mvdyn_gtsam.progress import Progress
-from mvdyn_gtsam.refinement.axes import main_axes
 from mvdyn_gtsam.refinement.connections import Pair, neighbours_of, refinement_pairs
 from mvdyn_gtsam.refinement.context import COLOUR, LABELS, Context, smooth_colour
-from mvdyn_gtsam.refinement.free_space import SIGHT
-from mvdyn_gtsam.refinement.growth import Growth
-from mvdyn_gtsam.refinement.moving_depth import RegionDepth
-from mvdyn_gtsam.refinement.moving_shape import FITTED
+from mvdyn_gtsam.refinement.finish import FinishedFrame
+from mvdyn_gtsam.refinement.moving.free_space import SIGHT
+from mvdyn_gtsam.refinement.moving.growth import Growth
+from mvdyn_gtsam.refinement.moving.over_time import depth_of_regions
+from mvdyn_gtsam.refinement.moving.region_depth import RegionDepth
+from mvdyn_gtsam.refinement.moving.relief import RELIEF
+from mvdyn_gtsam.refinement.moving.shape import FITTED
 from mvdyn_gtsam.refinement.neighbours import swept_times
-from mvdyn_gtsam.refinement.over_time import depth_of_regions
+from mvdyn_gtsam.refinement.plain.axes import main_axes
+from mvdyn_gtsam.refinement.plain.filling import AXES, PLANES
 from mvdyn_gtsam.refinement.pool import TaskPool, worker_count
-from mvdyn_gtsam.refinement.poses import solve_poses
-from mvdyn_gtsam.refinement.relief import RELIEF
-from mvdyn_gtsam.refinement.samples import FrameSample, SampleStore
-from mvdyn_gtsam.refinement.scale import solve_scales
 from mvdyn_gtsam.refinement.settings import RefinementConfig
-from mvdyn_gtsam.refinement.tasks import AXES, FIRST_DEPTH, GUIDE_STEPS, PLANES, FinishedFrame, windows
+from mvdyn_gtsam.refinement.solve.poses import solve_poses
+from mvdyn_gtsam.refinement.solve.samples import FrameSample, SampleStore
+from mvdyn_gtsam.refinement.solve.scale import solve_scales
+from mvdyn_gtsam.refinement.tasks import FIRST_DEPTH, GUIDE_STEPS, windows
 from mvdyn_gtsam.refinement.views import DenseView
 from mvdyn_gtsam.refinement.workspace import Workspace
 

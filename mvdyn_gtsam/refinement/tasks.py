@@ -7,55 +7,45 @@ processes there are, nor on their order.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
 from mvdyn_gtsam.refinement.connections import Pair
-from mvdyn_gtsam.refinement.context import LABELS, MOVING, STATIC, UNEXPLAINED, Context
-from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, solve_frame
-from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, flow_targets, load_edges
-from mvdyn_gtsam.refinement.growth import growth_task
+from mvdyn_gtsam.refinement.context import CHECK_SPACING, LABELS, STATIC, Context
+from mvdyn_gtsam.refinement.edges import Edge, flow_targets, load_edges
+from mvdyn_gtsam.refinement.finish import finish_task
 from mvdyn_gtsam.refinement.initial import (
     best_candidate,
     failing_regions,
     most_telling,
     static_residual,
 )
-from mvdyn_gtsam.refinement.lattice import neighbour_likeness
 from mvdyn_gtsam.refinement.measurement import carry_sweep, measure_pair, sweep_frame, sweep_moving
-from mvdyn_gtsam.refinement.motion import (
+from mvdyn_gtsam.refinement.moving.growth import growth_task
+from mvdyn_gtsam.refinement.moving.motion import (
     carry_task,
     free_space_task,
     moving_depth_task,
     observe_task,
     settle_task,
 )
-from mvdyn_gtsam.refinement.moving_shape import fit_task, shape_task
+from mvdyn_gtsam.refinement.moving.relief import relief_task
+from mvdyn_gtsam.refinement.moving.shape import fit_task, shape_task
 from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
-from mvdyn_gtsam.refinement.planes import (
-    PlainRegion,
-    fill_plain,
-    plain_regions,
-    planes_in_world,
-    rim_planes,
-    surfaces,
-)
-from mvdyn_gtsam.refinement.relief import relief_task
-from mvdyn_gtsam.refinement.samples import FrameSample
+from mvdyn_gtsam.refinement.plain.filling import fill_task, planes_task, surfaces_task
+from mvdyn_gtsam.refinement.solve.depth import DepthPrior, FrameProblem, solve_frame
+from mvdyn_gtsam.refinement.solve.lattice import neighbour_likeness
+from mvdyn_gtsam.refinement.solve.samples import FrameSample
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 SAMPLE_SPACING = 16
 """Distance of the pixels that phase 1 and the poses see, px of the input."""
-CHECK_SPACING = 8
-"""Distance of the pixels that choose edges and whose residuals are compared, px of the input."""
 FIRST_STEPS = 2
 """Gauss-Newton steps before it is asked what moves."""
 GUIDE_STEPS = 2
@@ -63,12 +53,6 @@ GUIDE_STEPS = 2
 
 FIRST_DEPTH = "depth 0"
 """The array of the first depth solve, from flow within cameras; it guides the flow between them."""
-
-AXES = "axes"
-"""The list ``(N, 4)`` of the directions of all scenes: the first camera of its group, and unit vectors in its
-world."""
-PLANES = "planes"
-"""The list ``(N, 7)`` of all planes of plain regions: camera, time, and ``planes_in_world``."""
 
 
 def sweep_task(context: Context, frame: Frame) -> None:
@@ -183,69 +167,6 @@ def _edges_of(
     ]
 
 
-def surfaces_task(context: Context, job: tuple[str, Frame]) -> Array:
-    """Unit normals in the world and shares ``(N, 4)`` of a frame's largest well seen surfaces: ``(read from,
-    frame)``."""
-    name, frame = job
-    trust = _still_trust(context, frame)
-    rays, config = context.workspace.views[frame[0]].rays, context.config.plain
-    found = surfaces(np.log(context.image(name, frame)), trust, rays, config, seed=frame)
-    normals = found[:, :3] / np.linalg.norm(found[:, :3], axis=1, keepdims=True)
-    return np.column_stack([normals @ context.poses()[frame][:3, :3].T, found[:, 3]])
-
-
-def planes_task(context: Context, job: tuple[str, Frame]) -> Array:
-    """Planes ``(N, 5)`` in the world that the rims of a frame's plain regions fit: ``(read from, frame)``."""
-    name, frame = job
-    found, _ = _plain_regions(context, name, frame)
-    axes, config = _axes_seen(context, frame), context.config.plain
-    rims = [rim_planes(region, axes, config, seed=(*frame, number)) for number, region in enumerate(found)]
-    return planes_in_world(rims, context.poses()[frame])
-
-
-def fill_task(context: Context, job: tuple[str, str, Frame]) -> None:
-    """Give a frame's plain regions the planes that the frames around agree on: ``(read from, write to,
-    frame)``."""
-    source, target, frame = job
-    found, trust = _plain_regions(context, source, frame)
-    bank = context.workspace.read_array(PLANES)
-    near = np.abs(bank[:, 1] - frame[1]) <= context.config.plain.window
-    near &= np.isin(bank[:, 0], context.group_of(frame[0]))
-    theta = fill_plain(
-        np.log(context.image(source, frame)),
-        trust,
-        found,
-        bank[near],
-        context.poses()[frame],
-        _axes_seen(context, frame),
-        context.config.plain,
-    )
-    context.workspace.write(target, frame, np.exp(theta))
-
-
-def _plain_regions(context: Context, name: str, frame: Frame) -> tuple[list[PlainRegion], Float32]:
-    """Plain regions of a frame, and the trust ``(h, w)`` in its depth; nothing of what moves is trusted."""
-    view, trust = context.workspace.views[frame[0]], _still_trust(context, frame)
-    moves = np.asarray(context.workspace.read("moving", frame)) != STATIC
-    theta, colour = np.log(context.image(name, frame)), context.colour(frame)
-    return plain_regions(colour, theta, trust, moves, view.rays, context.config.plain, seed=frame), trust
-
-
-def _still_trust(context: Context, frame: Frame) -> Float32:
-    """Trust ``(h, w)`` in a frame's depth, none in that of what moves and around it."""
-    trust = context.trust(frame)
-    moves = (np.asarray(context.workspace.read("moving", frame)) != STATIC).astype(np.uint8)
-    trust[cv2.dilate(moves, np.ones((5, 5), np.uint8)) > 0] = 0.0
-    return trust
-
-
-def _axes_seen(context: Context, frame: Frame) -> Array:
-    """Directions ``(K, 3)`` of the scene in the axes of a frame's camera."""
-    axes = context.workspace.read_array(AXES)
-    own = axes[np.isin(axes[:, 0], context.group_of(frame[0]))]
-    return np.asarray(own[:, 1:] @ context.poses()[frame][:3, :3])
-
-
 def sample_task(context: Context, job: tuple[str, Frame]) -> FrameSample:
     """A frame's pixels on a coarse raster, with depth of the array named first and flow to all neighbours."""
     depth_name, frame = job
@@ -275,92 +196,6 @@ def sample_task(context: Context, job: tuple[str, Frame]) -> FrameSample:
         weight=weight,
         inverse_depth_there=there,
     )
-
-
-@dataclass(frozen=True)
-class FinishedFrame:
-    """A frame at the input resolution."""
-
-    frame: Frame
-    depth: Float32
-    """``(H, W)``"""
-    confidence: Float32
-    """``(H, W)`` in [0, 1]"""
-    moving: npt.NDArray[np.uint8]
-    """``(H, W)`` 255 where it moves: the static model fails and the views of the instant agree on a depth;
-    128 where it fails and they do not."""
-    before_px: dict[int, float]
-    """Median residual of the flow to each camera with the tracked depth and poses; no entry without flow."""
-    after_px: dict[int, float]
-    """The same with those of the refinement."""
-
-
-def finish_task(context: Context, job: tuple[str, Frame]) -> FinishedFrame:
-    """Depth, confidence and motion mask of a frame from the array named first."""
-    name, frame = job
-    view = context.workspace.views[frame[0]]
-    # as in tracking: confidence falls to a half at 5 % error
-    confidence = context.trust(frame)
-    moving = np.asarray(context.workspace.read("moving", frame))
-    confidence[moving == MOVING] = np.maximum(confidence, 0.5)[moving == MOVING]
-    confidence[moving == UNEXPLAINED] = 0.0
-    grey = np.asarray(context.workspace.read("grey", frame), np.uint8)
-    size = (view.camera.width, view.camera.height)
-    mask = np.array([0, 255, 128], np.uint8)[moving]
-    inverse_depth = context.image(name, frame)
-    checked = context.raster(frame, CHECK_SPACING)
-    edges = context.edges(frame, context.poses(), own_camera=False, among=checked)
-    tracked_wTc = context.workspace.read_array("tracked_poses")
-    before = context.edges(frame, tracked_wTc, own_camera=False, among=checked)
-    return FinishedFrame(
-        frame=frame,
-        depth=1.0 / upsample(inverse_depth, grey, context.config.edge_contrast),
-        confidence=view.grow(confidence),
-        moving=np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)),
-        before_px=_median_residuals(before, context.image("tracked", frame)),
-        after_px=_median_residuals(edges, inverse_depth),
-    )
-
-
-def _median_residuals(edges: Sequence[Edge], inverse_depth: Float32) -> dict[int, float]:
-    """By camera that the edges lead to."""
-    residuals: dict[int, list[Float32]] = {}
-    for edge in edges:
-        sure = edge.weight >= SURE_WEIGHT
-        terms = edge.terms(inverse_depth.ravel()[edge.pixels])
-        residual = terms.residual[sure & terms.valid]
-        residuals.setdefault(edge.j[0], []).append(np.hypot(residual[:, 0], residual[:, 1]))
-    return {
-        camera: float(np.median(np.concatenate(values)))
-        for camera, values in residuals.items()
-        if sum(map(len, values)) > 0
-    }
-
-
-def upsample(inverse_depth: Float32, grey: npt.NDArray[np.uint8], contrast: float) -> Float32:
-    """``(H, W)`` of ``(h, w)``: a pixel takes the four around it by nearness and likeness of luminance.
-
-    Joint bilateral upsampling (https://dl.acm.org/doi/10.1145/1276377.1276497) of log depth.
-    """
-    height, width = grey.shape
-    if inverse_depth.shape == grey.shape:
-        return inverse_depth
-    luminance = cv2.GaussianBlur(grey, (0, 0), 0.7).astype(np.float32)
-    small = cv2.resize(luminance, inverse_depth.shape[::-1], interpolation=cv2.INTER_AREA)
-    theta = np.log(inverse_depth)
-    rows = (np.arange(height, dtype=np.float32) + 0.5) * inverse_depth.shape[0] / height - 0.5
-    cols = (np.arange(width, dtype=np.float32) + 0.5) * inverse_depth.shape[1] / width - 0.5
-    total, value = np.zeros_like(luminance), np.zeros_like(luminance)
-    top, left = np.floor(rows), np.floor(cols)
-    for row, near_row in ((top, 1.0 - (rows - top)), (top + 1, rows - top)):
-        for col, near_col in ((left, 1.0 - (cols - left)), (left + 1, cols - left)):
-            y = np.clip(row, 0, inverse_depth.shape[0] - 1).astype(int)
-            x = np.clip(col, 0, inverse_depth.shape[1] - 1).astype(int)
-            unlike = (luminance - small[y[:, None], x]) / np.float32(contrast)
-            share = (near_row[:, None] * near_col) * (np.exp(-(unlike**2)) + np.float32(1e-3))
-            total += share
-            value += share * theta[y[:, None], x]
-    return np.exp(value / total).astype(np.float32)
 
 
 def _image_weights(context: Context, frame: Frame) -> tuple[Float32, Float32]:

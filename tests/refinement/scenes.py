@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mvdyn_gtsam.geometry import invert_pose, pixel_rays, project, transform_points
 from mvdyn_gtsam.graph.connections import Frame
-from mvdyn_gtsam.refinement.samples import FrameSample
+from mvdyn_gtsam.refinement.solve.samples import FrameSample
 
 Array = npt.NDArray[np.float64]
 DepthOf = Callable[[Frame, Array], Array]

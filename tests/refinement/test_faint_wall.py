@@ -12,8 +12,8 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, FlowConfig
 from mvdyn_gtsam.refinement.context import COLOUR, Context, smooth_colour, trust_of
 from mvdyn_gtsam.refinement.edges import flow_targets
-from mvdyn_gtsam.refinement.free_space import SIGHT
-from mvdyn_gtsam.refinement.motion import settle_task
+from mvdyn_gtsam.refinement.moving.free_space import SIGHT
+from mvdyn_gtsam.refinement.moving.motion import settle_task
 from mvdyn_gtsam.refinement.other_times import FirstDepth, told_by_other_times
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 from mvdyn_gtsam.refinement.views import DenseView

@@ -10,7 +10,6 @@ import pytest
 
 from mvdyn_gtsam.frontend.dense_flow import Float32
 from mvdyn_gtsam.graph.connections import Frame
-from mvdyn_gtsam.refinement.depth import DepthPrior, FrameProblem, solve_frame
 from mvdyn_gtsam.refinement.edges import SURE_WEIGHT, Edge, FlowTargets, flow_targets
 from mvdyn_gtsam.refinement.initial import (
     _triangulated,
@@ -23,9 +22,10 @@ from mvdyn_gtsam.refinement.initial import (
     proven_still,
     static_residual,
 )
-from mvdyn_gtsam.refinement.lattice import neighbour_likeness
-from mvdyn_gtsam.refinement.residuals import confidence
 from mvdyn_gtsam.refinement.settings import RefinementConfig
+from mvdyn_gtsam.refinement.solve.depth import DepthPrior, FrameProblem, solve_frame
+from mvdyn_gtsam.refinement.solve.lattice import neighbour_likeness
+from mvdyn_gtsam.refinement.solve.residuals import confidence
 from tests.refinement.dense_edges import (
     Mask,
     small_view,
