@@ -8,13 +8,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.errors import BaselineError
+from mvdyn_gtsam.frontend.onnx_model import OnnxModel
 
 logger = logging.getLogger(__name__)
 
@@ -38,12 +38,7 @@ def describe_images(
         if size is not None and size != (image.shape[1], image.shape[0]):
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         planes = np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1)[None], dtype=np.float32) / 255.0
-        try:
-            descriptor = np.asarray(session.run(None, {feed: planes})[0], dtype=np.float32).ravel()
-        except Exception as error:  # onnxruntime's own exceptions have no common base but this
-            raise BaselineError(
-                f"{model}: fails on a frame ({' '.join(str(error).split())[:200]})"
-            ) from error
+        descriptor = session.run({feed: planes}, None, name)[0].astype(np.float32).ravel()
         length = float(np.linalg.norm(descriptor))
         if not np.isfinite(length) or length == 0.0 or (rows and len(descriptor) != len(rows[0])):
             raise BaselineError(f"{model}: gives no descriptor of one length and finite values for {name}")
@@ -72,27 +67,15 @@ def retrieved_pairs(
     return [(names[first], names[second]) for first, second in sorted(found)]
 
 
-def _open(model: Path, num_threads: int) -> tuple[Any, str, tuple[int, int] | None]:
-    """Session, name of its input, and ``(width, height)`` where the model fixes them."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    if num_threads > 0:
-        options.intra_op_num_threads = num_threads
-    try:
-        session = onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # as above
-        reason = " ".join(str(error).split())[:200]
-        raise BaselineError(f"{model}: cannot be read as an ONNX model ({reason})") from error
-    inputs = session.get_inputs()
-    shape = inputs[0].shape if inputs else []
+def _open(path: Path, num_threads: int) -> tuple[OnnxModel, str, tuple[int, int] | None]:
+    """The model, name of its input, and ``(width, height)`` where the model fixes them."""
+    model = OnnxModel(path, num_threads, BaselineError)
+    inputs = model.signature.inputs
+    shape = inputs[0].shape if inputs else ()
     fits = len(inputs) == 1 and len(shape) == 4 and inputs[0].type == "tensor(float)"
     if not fits or shape[1] not in (3, None) and not isinstance(shape[1], str):
-        described = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs) or "nothing"
-        raise BaselineError(
-            f"{model}: takes {described}; it must take one float32 (1, 3, H, W), RGB in [0, 1]"
-        )
+        described = ", ".join(map(str, inputs)) or "nothing"
+        raise BaselineError(f"{path}: takes {described}; it must take one float32 (1, 3, H, W), RGB in [0, 1]")
     height, width = shape[2], shape[3]
     size = (width, height) if isinstance(height, int) and isinstance(width, int) else None
-    return session, inputs[0].name, size
+    return model, inputs[0].name, size
