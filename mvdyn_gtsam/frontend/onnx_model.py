@@ -1,4 +1,4 @@
-"""An ONNX model that the user brings: opened with clear errors, described in one line, identified by content."""
+"""An ONNX model that the user brings: opened with clear errors, described in one line, told from others."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.errors import MvdynError
 
-NUMPY_TYPES = {
+NUMPY_TYPES: dict[str, np.dtype[Any]] = {
     "tensor(float)": np.dtype(np.float32),
     "tensor(float16)": np.dtype(np.float16),
     "tensor(int64)": np.dtype(np.int64),
@@ -66,7 +66,7 @@ class OnnxModel:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
-        options.log_severity_level = 3
+        options.log_severity_level = 4  # what it would print is in the exceptions
         if threads > 0:
             options.intra_op_num_threads = threads
         # Its threads would burn the processors in between, while others work:

@@ -1,0 +1,133 @@
+"""Images on their way into a network of another size, and depth on its way back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from mvdyn_gtsam.frontend.depth_adapter import ImageInput, SizeRule
+from mvdyn_gtsam.frontend.depth_prior import Float32
+
+INTERPOLATIONS = {
+    "nearest": cv2.INTER_NEAREST_EXACT,
+    "linear": cv2.INTER_LINEAR,
+    "cubic": cv2.INTER_CUBIC,
+    "area": cv2.INTER_AREA,
+}
+ONE_SURFACE = 1.1
+"""Largest ratio of the depths of neighbours that are taken for one surface; as ``LIKE_LOG_DEPTH`` of
+tracking."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a frame lies in the image that a network sees; sizes are ``(width, height)`` px."""
+
+    frame: tuple[int, int]
+    inner: tuple[int, int]
+    """Of the resized frame."""
+    canvas: tuple[int, int]
+    """Of the whole, padding included."""
+
+    @property
+    def offset(self) -> tuple[int, int]:
+        """The resized frame's first pixel on the canvas."""
+        return (self.canvas[0] - self.inner[0]) // 2, (self.canvas[1] - self.inner[1]) // 2
+
+    def intrinsics(self, frame: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """``(3, 3)`` of the canvas, from those of the frame: ``x' = (x + 0.5) s - 0.5``, and the offset."""
+        result = frame.copy()
+        for axis in (0, 1):
+            scale = self.inner[axis] / self.frame[axis]
+            result[axis] *= scale
+            result[axis, 2] += 0.5 * scale - 0.5 + self.offset[axis]
+        return result
+
+    def nearest(self, field: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """``(h, w)`` over the canvas, at any resolution, brought to the frame by nearest pixels."""
+        (_, _, columns), (_, _, rows) = self._positions(field.shape, 0), self._positions(field.shape, 1)
+        return field[rows[:, None], columns]
+
+    def depth(self, depth: Float32) -> Float32:
+        """Depth ``(h, w)`` over the canvas, at any resolution, brought to the frame without mixing surfaces.
+
+        Where the four pixels around are one surface it is interpolated linearly in inverse depth, which is
+        exact on planes; elsewhere the nearest pixel has the word.
+        """
+        nearest = self.nearest(depth)
+        (left, x, _), (top, y, _) = self._positions(depth.shape, 0), self._positions(depth.shape, 1)
+        if not (x.any() or y.any()):
+            return nearest
+        right, bottom = np.where(x > 0.0, left + 1, left), np.where(y > 0.0, top + 1, top)
+        corners = [depth[row[:, None], column] for row in (top, bottom) for column in (left, right)]
+        y = y[:, None]
+        weights = ((1.0 - y) * (1.0 - x), (1.0 - y) * x, y * (1.0 - x), y * x)
+        smallest, largest = np.minimum.reduce(corners), np.maximum.reduce(corners)  # NaN where any is
+        one_surface = (smallest > 0.0) & (largest <= ONE_SURFACE * smallest)
+        with np.errstate(divide="ignore", invalid="ignore"):  # of what is not taken
+            inverse = sum(weight / corner for weight, corner in zip(weights, corners, strict=True))
+            return np.where(one_surface, 1.0 / inverse, nearest).astype(np.float32)
+
+    def _positions(
+        self, shape: tuple[int, ...], axis: int
+    ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.float64], npt.NDArray[np.intp]]:
+        """For each of the frame's columns (``axis`` 0) or rows: the pixel of the field before it, how far it
+        is behind that, and the nearest; none of them in the padding."""
+        length = shape[1 - axis]
+        size, inner, canvas = self.frame[axis], self.inner[axis], self.canvas[axis]
+        scale = length / canvas
+        first = int(np.ceil(self.offset[axis] * scale - 1e-9))
+        last = max(first, int(np.floor((self.offset[axis] + inner) * scale + 1e-9)) - 1)
+        on_canvas = (np.arange(size) + 0.5) * (inner / size) + self.offset[axis]
+        # rounded, so that equal sizes are equal
+        position = np.clip(np.round(on_canvas * scale - 0.5, 6), first, last)
+        before = np.floor(position).astype(np.intp)
+        return before, position - before, np.floor(position + 0.5).astype(np.intp)
+
+
+def place(frame: tuple[int, int], rule: SizeRule, fixed: tuple[int, int] | None) -> Placement:
+    """Where a frame of ``(width, height)`` comes by ``rule``; ``fixed``: size of a network that has one."""
+    if fixed is not None:
+        if rule.fixed == "stretch":
+            return Placement(frame, fixed, fixed)
+        scale = min(fixed[0] / frame[0], fixed[1] / frame[1])
+        inner = (_whole(frame[0] * scale, 1, fixed[0]), _whole(frame[1] * scale, 1, fixed[1]))
+        return Placement(frame, inner, fixed)
+    scale = 1.0
+    if rule.short_side is not None:
+        scale = rule.short_side / min(frame)
+    elif rule.long_side is not None:
+        scale = rule.long_side / max(frame)
+    elif rule.pixels is not None:
+        count = frame[0] * frame[1]
+        scale = (min(max(count, rule.pixels[0]), rule.pixels[1]) / count) ** 0.5
+    inner = (_whole(frame[0] * scale, rule.multiple), _whole(frame[1] * scale, rule.multiple))
+    return Placement(frame, inner, inner)
+
+
+def network_image(image: npt.NDArray[np.uint8], rule: ImageInput, placement: Placement) -> Float32:
+    """What the network sees of ``image (H, W, 3) uint8`` RGB: ``(1, 3, H', W')``, or of rank 5."""
+    colours = image.astype(np.float32) / np.float32(255.0)
+    colours = colours if rule.channels == "RGB" else colours[..., ::-1]
+    if placement.inner != placement.frame:
+        smaller = placement.inner[0] * placement.inner[1] < placement.frame[0] * placement.frame[1]
+        way = INTERPOLATIONS[rule.reduce if smaller else rule.enlarge]
+        colours = cv2.resize(np.ascontiguousarray(colours), placement.inner, interpolation=way)
+    canvas = np.empty((placement.canvas[1], placement.canvas[0], 3), np.float32)
+    canvas[:] = rule.padding
+    (left, top), (width, height) = placement.offset, placement.inner
+    canvas[top : top + height, left : left + width] = colours
+    mean, std = np.array(rule.mean, np.float32), np.array(rule.std, np.float32)
+    canvas = (canvas * np.float32(rule.maximum) - mean) / std
+    return np.ascontiguousarray(canvas.transpose(2, 0, 1)).reshape(
+        (*(1,) * (rule.rank - 3), 3, *canvas.shape[:2])
+    )
+
+
+def _whole(length: float, multiple: int, most: int | None = None) -> int:
+    rounded = max(1, round(length / multiple)) * multiple
+    return rounded if most is None else min(rounded, most)
