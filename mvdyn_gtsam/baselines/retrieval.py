@@ -75,7 +75,9 @@ def _open(path: Path, num_threads: int) -> tuple[OnnxModel, str, tuple[int, int]
     fits = len(inputs) == 1 and len(shape) == 4 and inputs[0].type == "tensor(float)"
     if not fits or shape[1] not in (3, None) and not isinstance(shape[1], str):
         described = ", ".join(map(str, inputs)) or "nothing"
-        raise BaselineError(f"{path}: takes {described}; it must take one float32 (1, 3, H, W), RGB in [0, 1]")
+        raise BaselineError(
+            f"{path}: takes {described}; it must take one float32 (1, 3, H, W), RGB in [0, 1]"
+        )
     height, width = shape[2], shape[3]
     size = (width, height) if isinstance(height, int) and isinstance(width, int) else None
     return model, inputs[0].name, size

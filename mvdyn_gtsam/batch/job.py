@@ -42,7 +42,11 @@ class Plan:
     command: tuple[str, ...] = ()
     """In place of ``mvdyn reconstruct``, for tests."""
     depth_priors: Path | None = None
-    """Folder of the depth priors, one folder per clip."""
+    """Folder of the depth priors, one folder per clip, or the ONNX file of a network for all clips."""
+    depth_model: str | None = None
+    """Which network that file holds, where it does not tell."""
+    depth_network: str | None = None
+    """What results call that file; None for a folder."""
 
     @property
     def state_folder(self) -> Path:
@@ -69,8 +73,17 @@ class Plan:
 
     def depth_prior(self, clip: Clip) -> Path | None:
         """The depth prior of ``clip``, None where it has none."""
-        folder = None if self.depth_priors is None else self.depth_priors / clip.name
-        return folder if folder is not None and folder.is_dir() else None
+        if self.depth_priors is None or self.depth_network is not None:
+            return self.depth_priors
+        folder = self.depth_priors / clip.name
+        return folder if folder.is_dir() else None
+
+    def depth_prior_name(self, clip: Clip) -> str | None:
+        """What a result made with it says of it."""
+        if self.depth_network is not None:
+            return self.depth_network
+        folder = self.depth_prior(clip)
+        return None if folder is None else depth_files_name(folder)
 
     def wanted(self) -> bool:
         """Whether the run is still on."""
@@ -101,8 +114,8 @@ def is_finished(clip: Clip, plan: Plan) -> bool:
     """
     if not is_reconstruction(plan.result(clip)):
         return False
-    result, depth_prior = Reconstruction.load(plan.result(clip)), plan.depth_prior(clip)
-    if depth_prior is not None and result.manifest.get("depth_prior") != depth_files_name(depth_prior):
+    result, depth_prior = Reconstruction.load(plan.result(clip)), plan.depth_prior_name(clip)
+    if depth_prior is not None and result.manifest.get("depth_prior") != depth_prior:
         return False
     asked = json.loads(plan.config_file.read_text())
     try:
@@ -164,6 +177,7 @@ def _run(clip: Clip, plan: Plan) -> ProcessUsage:
     command += ["--config", str(plan.config_file)]
     if (depth_prior := plan.depth_prior(clip)) is not None:
         command += ["--depth-prior", str(depth_prior)]
+        command += ["--depth-model", plan.depth_model] if plan.depth_model is not None else []
     if not json.loads(plan.config_file.read_text()).get("refinement", {}).get("workers"):  # 0 is the default
         command += ["--set", f"refinement.workers={threads}"]
     environment = {**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), str(threads))}

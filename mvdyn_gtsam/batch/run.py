@@ -19,7 +19,8 @@ from mvdyn_gtsam.batch.job import Plan, described, is_finished, needs_scores, re
 from mvdyn_gtsam.batch.report import BatchReport, Row, State, read_rows
 from mvdyn_gtsam.batch.scheduling import local_cluster, remote_cluster, require_dask, run_clips
 from mvdyn_gtsam.config import Config, given_settings
-from mvdyn_gtsam.errors import MvdynError
+from mvdyn_gtsam.errors import DepthPriorError, MvdynError
+from mvdyn_gtsam.frontend.onnx_depth import OnnxDepth, is_model
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction.files import write_atomically, write_json
 from mvdyn_gtsam.refinement.pool import worker_count
@@ -48,7 +49,9 @@ class BatchSettings:
     """Leave clips alone that failed in the earlier run."""
     depth_priors: Path | None = None
     """Folder with one folder per clip, of its name: depth of its single images. A clip without one has no
-    depth prior."""
+    depth prior. Or the ONNX file of a network, for all clips."""
+    depth_model: str | None = None
+    """Which network that file holds, where it does not tell."""
     command: tuple[str, ...] = ()
     """In place of ``mvdyn reconstruct``, for tests."""
 
@@ -66,8 +69,8 @@ def run_batch(
 
     ``out/<name>.log`` holds what each said, ``out/batch.json`` and ``batch.md`` the table, written anew after
     each clip. ``config`` is as in ``reconstruct`` with ``resume``: clips that were begun keep their settings.
-    A clip that fails is a row. Raises BatchError, in one line, where nothing can be started or
-    another batch works on ``out``.
+    A clip that fails is a row. Raises, in one line, BatchError where nothing can be started or another batch
+    works on ``out``, and DepthPriorError for a network that cannot be a depth prior.
     """
     settings = settings or BatchSettings()
     require_dask()
@@ -83,6 +86,8 @@ def run_batch(
         settings.evaluate,
         settings.command,
         None if settings.depth_priors is None else settings.depth_priors.absolute(),
+        settings.depth_model,
+        _depth_network(settings),
     )
     _check_depth_priors(clips, plan)
     with _claimed(plan, given_settings(config)):
@@ -173,7 +178,7 @@ def _is_left(clip: Clip, plan: Plan, row: Row, settings: BatchSettings) -> bool:
 
 
 def _check_depth_priors(clips: Sequence[Clip], plan: Plan) -> None:
-    if plan.depth_priors is None:
+    if plan.depth_priors is None or plan.depth_network is not None:
         return
     without = [clip.name for clip in clips if plan.depth_prior(clip) is None]
     if len(without) == len(clips):
@@ -183,6 +188,21 @@ def _check_depth_priors(clips: Sequence[Clip], plan: Plan) -> None:
         )
     if without:
         logger.warning("%s: no depth prior for %s", plan.depth_priors, ", ".join(without))
+
+
+def _depth_network(settings: BatchSettings) -> str | None:
+    """What results call the network of all clips, None where there is none; it is opened here once.
+
+    Raises DepthPriorError where it cannot be used.
+    """
+    path = settings.depth_priors
+    if path is not None and is_model(path):
+        return OnnxDepth(path.absolute(), settings.depth_model).name
+    if settings.depth_model is not None:
+        raise DepthPriorError(
+            f"--depth-model {settings.depth_model}: needs the network's file, --depth-prior MODEL.onnx"
+        )
+    return None
 
 
 def _require_evaluation(clips: Sequence[Clip]) -> None:

@@ -40,6 +40,16 @@ def add_capture_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_depth_model_argument(parser: argparse.ArgumentParser) -> None:
+    """--depth-model."""
+    parser.add_argument(
+        "--depth-model",
+        metavar="NAME",
+        help="which network the .onnx file of --depth-prior holds, where its inputs and outputs do not tell:"
+        " moge-2, unidepth-v2, depth-anything-v2-metric or depth-anything-3-metric",
+    )
+
+
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """--config and --set."""
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML or JSON file of settings")

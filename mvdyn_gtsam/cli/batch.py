@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mvdyn_gtsam.cli.arguments import add_config_arguments, read_settings
+from mvdyn_gtsam.cli.arguments import add_config_arguments, add_depth_model_argument, read_settings
 from mvdyn_gtsam.cli.progress import ConsoleProgress
 from mvdyn_gtsam.cli.reconstruct import STAGES
 
@@ -27,6 +27,7 @@ examples:
   mvdyn batch clips --out results
   mvdyn batch MultiCamVideo-Dataset/val --out results --workers 8 --timeout 3600
   mvdyn batch clips --out results --skip-failed             # the rest, without what failed before
+  mvdyn batch clips --out results --depth-prior moge-2-vits-normal.onnx   # one network for all clips
   mvdyn batch clips --out results --scheduler tcp://10.0.0.1:8786   # FOLDER and OUT seen by all machines
 
 Workers of a scheduler (dask worker ADDRESS --nthreads 2) run one clip per thread; started with --no-nanny
@@ -44,10 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depth-prior",
         type=Path,
-        metavar="FOLDER",
+        metavar="FOLDER|MODEL.onnx",
         help="z-depth of single images as for reconstruct: FOLDER/<clip>/<camera>/000012.npy, <clip> as its"
-        " result is named; clips without a folder have none",
+        " result is named; clips without a folder have none. Or one network for all clips",
     )
+    add_depth_model_argument(parser)
     add_config_arguments(parser)
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
@@ -97,6 +99,7 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
         evaluate=arguments.evaluate,
         skip_failed=arguments.skip_failed,
         depth_priors=arguments.depth_prior,
+        depth_model=arguments.depth_model,
     )
     try:
         with ConsoleProgress(messages) as progress:

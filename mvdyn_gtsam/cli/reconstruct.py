@@ -11,9 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from mvdyn_gtsam.cli.arguments import add_capture_arguments, add_config_arguments, read_capture, read_settings
+from mvdyn_gtsam.cli.arguments import (
+    add_capture_arguments,
+    add_config_arguments,
+    add_depth_model_argument,
+    read_capture,
+    read_settings,
+)
 from mvdyn_gtsam.cli.progress import ConsoleProgress
-from mvdyn_gtsam.errors import ResultError
+from mvdyn_gtsam.errors import DepthPriorError, ResultError
 
 if TYPE_CHECKING:
     from mvdyn_gtsam.capture import Capture
@@ -28,7 +34,11 @@ OUT gets manifest.json, trajectories/<camera>.txt (TUM, camera-to-world), depth/
 Ctrl-C at any time: what is in OUT can be read, and --resume continues, with the settings it began with:
 --set and --config may change those of stages that are not finished; settings that are new since take their
 defaults, and those that are no more are left out with a warning. A run that began with --depth-prior needs it
-again until tracking is finished."""
+again until tracking is finished.
+A depth prior is depth of single images: files that any network or sensor wrote, or a network itself, as an
+ONNX file that you bring. It must give depth in one unit for all frames, as MoGe-2, UniDepthV2,
+Depth-Anything-V2 metric and Depth-Anything-3 metric do. Others are described in a YAML file beside the model:
+docs/depth_models.md says how, and whose weights may not be used commercially."""
 EPILOG = """\
 examples:
   mvdyn reconstruct clip --out result
@@ -37,7 +47,9 @@ examples:
   mvdyn reconstruct clip --out result --stage tracking         # poses and rough depth, in half the time
   mvdyn reconstruct clip --out result --resume                # refine it later
   mvdyn reconstruct clip --out result --set tracking.window=20
-  mvdyn reconstruct clip --out result --depth-prior depth_of_single_images"""
+  mvdyn reconstruct clip --out result --depth-prior depth_of_single_images
+  mvdyn reconstruct clip --out result --depth-prior moge-2-vits-normal.onnx
+  mvdyn reconstruct clip --out result --depth-prior indoor.onnx --depth-model depth-anything-v2-metric"""
 
 STAGES = ("tracking", "refinement")
 BYTES_PER_PIXEL = 1.0
@@ -59,11 +71,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depth-prior",
         type=Path,
-        metavar="FOLDER",
+        metavar="FOLDER|MODEL.onnx",
         help="z-depth of single images, from a network or a sensor: FOLDER/<camera>/000012.npy, (H, W) in any"
         " unit, or .npz with depth and confidence (0 to 1); 0 or NaN is unknown, and so are frames without a"
-        " file; one scale and offset are found for all",
+        " file; or the network itself; one scale and offset are found for all",
     )
+    add_depth_model_argument(parser)
     add_config_arguments(parser)
     again = parser.add_mutually_exclusive_group()
     again.add_argument(
@@ -85,11 +98,7 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
     refuse_unusable(arguments.out, resume=arguments.resume, overwrite=arguments.overwrite)
     config = configure(arguments.out, settings, resume=arguments.resume).config
     capture = read_capture(arguments, config)
-    depth_prior = None
-    if arguments.depth_prior is not None:
-        from mvdyn_gtsam.frontend.depth_files import DepthFiles
-
-        depth_prior = DepthFiles(arguments.depth_prior, capture.cameras)
+    depth_prior = _depth_prior(arguments, capture)
     started = time.monotonic()
     result = reconstruct_with_progress(
         capture,
@@ -104,6 +113,19 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
     for line in summary(result, time.monotonic() - started):
         Console(soft_wrap=True, highlight=False, markup=False).print(line)
     return 0
+
+
+def _depth_prior(arguments: argparse.Namespace, capture: Capture) -> DepthPrior | None:
+    """The one that is asked for. Raises DepthPriorError."""
+    if arguments.depth_prior is None:
+        if arguments.depth_model is not None:
+            raise DepthPriorError(
+                f"--depth-model {arguments.depth_model}: needs the network's file, --depth-prior MODEL.onnx"
+            )
+        return None
+    from mvdyn_gtsam.frontend.onnx_depth import open_depth_prior
+
+    return open_depth_prior(arguments.depth_prior, capture.cameras, arguments.depth_model)
 
 
 def reconstruct_with_progress(

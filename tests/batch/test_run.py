@@ -19,9 +19,12 @@ import pytest
 from mvdyn_gtsam.batch import BatchError, BatchReport, BatchSettings, Clip, Row, State, guard, run_batch
 from mvdyn_gtsam.batch.scheduling import local_cluster, remote_cluster, run_clips
 from mvdyn_gtsam.config import load_config
+from mvdyn_gtsam.errors import DepthPriorError
+from mvdyn_gtsam.frontend.onnx_depth import OnnxDepth
 from tests.batch import stand_in
 from tests.batch.stand_in import true_poses, write_captures
 from tests.evaluation.fakes import write_groundtruth
+from tests.frontend.onnx_networks import depth_anything_v2
 
 SETTINGS = BatchSettings(
     stage="tracking", workers=2, threads=1, command=(sys.executable, "-S", stand_in.__file__)
@@ -150,6 +153,29 @@ def test_a_result_without_the_depth_prior_that_is_asked_for_is_not_kept(
     report = run_batch(folder, out, settings=settings)
     # the stand-in cannot write where a result is; mvdyn says what differs
     assert states(report) == {"clip": "failed"} and trace(out, "clip") == ["start", "end", "start"]
+
+
+def test_one_network_serves_every_clip_and_is_checked_first(tmp_path: Path, settings: BatchSettings) -> None:
+    folder, out = write_captures(tmp_path / "clips", {"a": {}, "b": {}}), tmp_path / "out"
+    model = depth_anything_v2(tmp_path / "m.onnx")
+    settings = dataclasses.replace(settings, depth_priors=model)
+    with pytest.raises(DepthPriorError, match="add --depth-model depth-anything-v2-metric"):
+        run_batch(folder, out, settings=settings)
+    assert not out.exists()
+    settings = dataclasses.replace(settings, depth_model="depth-anything-v2-metric")
+    assert states(run_batch(folder, out, settings=settings)) == {"a": "done", "b": "done"}
+    for name in "ab":
+        said = (out / f"{name}.trace").read_text()
+        assert f"--depth-prior {model} --depth-model depth-anything-v2-metric" in said
+    # the stand-in's result does not tell of a network; one that tells of this is kept
+    manifest = json.loads((out / "a" / "manifest.json").read_text())
+    manifest["depth_prior"] = OnnxDepth(model, "depth-anything-v2-metric").name
+    (out / "a" / "manifest.json").write_text(json.dumps(manifest))
+    assert states(run_batch(folder, out, settings=settings)) == {"a": "kept", "b": "failed"}
+    assert trace(out, "a") == ["start", "end"]
+    settings = dataclasses.replace(settings, depth_priors=None)
+    with pytest.raises(DepthPriorError, match="needs the network's file"):
+        run_batch(folder, out, settings=settings)
 
 
 def test_an_interrupted_batch_leaves_no_process_and_goes_on(tmp_path: Path, settings: BatchSettings) -> None:

@@ -49,12 +49,19 @@ def test_arguments_arrive_and_a_failed_clip_is_the_exit_code(
     words = [tmp_path / "clips", "--out", tmp_path / "out", "--set", "tracking.window=20"]
     words += ["--stage", "tracking", "--workers", 2, "--threads-per-worker", 3, "--retries", 1]
     words += ["--timeout", 60, "--no-evaluate", "--skip-failed"]
+    words += ["--depth-prior", "m.onnx", "--depth-model", "moge-2"]
     code, out, err = run(capsys, *words)
     assert seen == [
         tmp_path / "clips",
         tmp_path / "out",
         {"tracking": {"window": 20}},
-        BatchSettings("tracking", 2, 3, None, 1, 60.0, evaluate=False, skip_failed=True),
+        BatchSettings(
+            *("tracking", 2, 3, None, 1, 60.0),
+            evaluate=False,
+            skip_failed=True,
+            depth_priors=Path("m.onnx"),
+            depth_model="moge-2",
+        ),
     ]
     assert code == 0 and "good" in out and "2 x 41" in out
     assert "good: done, 33 s" in err and "batch 1/1" in err

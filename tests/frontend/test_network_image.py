@@ -73,7 +73,7 @@ def test_a_plane_comes_back_as_it_was(
         return 0.5 + slope[0] * (x - frame[0] / 2) / 4 + slope[1] * (y - frame[1] / 2) / 4
 
     width, height = (max(2, round(side * finer)) for side in fixed)
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    x, y = np.meshgrid(np.arange(float(width)), np.arange(float(height)))
     x, y = (
         (a + 0.5) * whole / part - 0.5 for a, whole, part in ((x, fixed[0], width), (y, fixed[1], height))
     )
