@@ -23,6 +23,10 @@ ONE_SURFACE = 1.1
 tracking."""
 
 
+BLOCK = 2**18
+"""Pixels that are brought back at a time: what they take stays in the cache."""
+
+
 @dataclass(frozen=True)
 class Placement:
     """Where a frame lies in the image that a network sees; sizes are ``(width, height)`` px."""
@@ -49,8 +53,8 @@ class Placement:
 
     def nearest(self, field: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """``(h, w)`` over the canvas, at any resolution, brought to the frame by nearest pixels."""
-        (_, _, columns), (_, _, rows) = self._positions(field.shape, 0), self._positions(field.shape, 1)
-        return field[rows[:, None], columns]
+        columns, rows = self._positions(field.shape, 0), self._positions(field.shape, 1)
+        return field[rows.nearest[:, None], columns.nearest]
 
     def depth(self, depth: Float32) -> Float32:
         """Depth ``(h, w)`` over the canvas, at any resolution, brought to the frame without mixing surfaces.
@@ -58,25 +62,18 @@ class Placement:
         Where the four pixels around are one surface it is interpolated linearly in inverse depth, which is
         exact on planes; elsewhere the nearest pixel has the word.
         """
-        nearest = self.nearest(depth)
-        (left, x, _), (top, y, _) = self._positions(depth.shape, 0), self._positions(depth.shape, 1)
-        if not (x.any() or y.any()):
-            return nearest
-        right, bottom = np.where(x > 0.0, left + 1, left), np.where(y > 0.0, top + 1, top)
-        corners = [depth[row[:, None], column] for row in (top, bottom) for column in (left, right)]
-        y = y[:, None]
-        weights = ((1.0 - y) * (1.0 - x), (1.0 - y) * x, y * (1.0 - x), y * x)
-        smallest, largest = np.minimum.reduce(corners), np.maximum.reduce(corners)  # NaN where any is
-        one_surface = (smallest > 0.0) & (largest <= ONE_SURFACE * smallest)
-        with np.errstate(divide="ignore", invalid="ignore"):  # of what is not taken
-            inverse = sum(weight / corner for weight, corner in zip(weights, corners, strict=True))
-            return np.where(one_surface, 1.0 / inverse, nearest).astype(np.float32)
+        columns, rows = self._positions(depth.shape, 0), self._positions(depth.shape, 1)
+        if not (columns.part.any() or rows.part.any()):
+            return self.nearest(depth)
+        result = np.empty(self.frame[::-1], np.float32)
+        step = max(1, BLOCK // self.frame[0])
+        for first in range(0, len(result), step):
+            block = slice(first, first + step)
+            result[block] = _interpolated(depth, rows.at(block), columns)
+        return result
 
-    def _positions(
-        self, shape: tuple[int, ...], axis: int
-    ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.float64], npt.NDArray[np.intp]]:
-        """For each of the frame's columns (``axis`` 0) or rows: the pixel of the field before it, how far it
-        is behind that, and the nearest; none of them in the padding."""
+    def _positions(self, shape: tuple[int, ...], axis: int) -> _Positions:
+        """Of the frame's columns (``axis`` 0) or rows in a field of ``shape``; none is in the padding."""
         length = shape[1 - axis]
         size, inner, canvas = self.frame[axis], self.inner[axis], self.canvas[axis]
         scale = length / canvas
@@ -85,8 +82,40 @@ class Placement:
         on_canvas = (np.arange(size) + 0.5) * (inner / size) + self.offset[axis]
         # rounded, so that equal sizes are equal
         position = np.clip(np.round(on_canvas * scale - 0.5, 6), first, last)
-        before = np.floor(position).astype(np.intp)
-        return before, position - before, np.floor(position + 0.5).astype(np.intp)
+        before = np.floor(position)
+        return _Positions(
+            before.astype(np.intp),
+            np.ceil(position).astype(np.intp),
+            (position - before).astype(np.float32),
+            np.floor(position + 0.5).astype(np.intp),
+        )
+
+
+@dataclass(frozen=True)
+class _Positions:
+    """Where columns or rows of a frame fall between those of a field, each ``(N,)``."""
+
+    before: npt.NDArray[np.intp]
+    after: npt.NDArray[np.intp]
+    part: Float32
+    """How far behind ``before``, of the way to ``after``."""
+    nearest: npt.NDArray[np.intp]
+
+    def at(self, block: slice) -> _Positions:
+        """Some of them."""
+        return _Positions(self.before[block], self.after[block], self.part[block], self.nearest[block])
+
+
+def _interpolated(depth: Float32, rows: _Positions, columns: _Positions) -> Float32:
+    """See ``Placement.depth``."""
+    upper, lower = depth[rows.before], depth[rows.after]
+    corners = [row[:, column] for row in (upper, lower) for column in (columns.before, columns.after)]
+    x, y = columns.part, rows.part[:, None]
+    weights = ((1 - y) * (1 - x), (1 - y) * x, y * (1 - x), y * x)
+    smallest, largest = np.minimum.reduce(corners), np.maximum.reduce(corners)  # NaN where any is
+    one_surface = (smallest > 0.0) & (largest <= np.float32(ONE_SURFACE) * smallest)
+    inverse = sum(weight / corner for weight, corner in zip(weights, corners, strict=True))
+    return np.where(one_surface, 1.0 / inverse, depth[rows.nearest[:, None], columns.nearest])
 
 
 def place(frame: tuple[int, int], rule: SizeRule, fixed: tuple[int, int] | None) -> Placement:

@@ -101,7 +101,7 @@ class OnnxDepth:
         depth = placement.depth(depth)
         known = np.isfinite(depth)
         # a black image, nothing but sky; or a broken model, which the start then finds to know too little
-        if not known.any() or (known.sum() > 1 and np.ptp(depth[known]) == 0.0):
+        if not known.any() or _is_constant(depth[known]):
             what = "one depth for all pixels" if known.any() else "no depth"
             logger.warning(
                 "%s: %s: %s gives %s; the frame is taken for unknown", self._path, frame, adapter.name, what
@@ -126,3 +126,8 @@ class OnnxDepth:
             name: np.ascontiguousarray(value).astype(NUMPY_TYPES[self._inputs[name].type])
             for name, value in feeds.items()
         }
+
+
+def _is_constant(depths: Float32) -> bool:
+    # resizing rounds in the last digit
+    return len(depths) > 1 and bool(np.ptp(depths) <= 1e-5 * depths.max())
