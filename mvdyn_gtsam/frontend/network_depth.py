@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from mvdyn_gtsam.frontend.depth_adapter import DepthAdapter, Validity
 from mvdyn_gtsam.frontend.depth_prior import Float32
+from mvdyn_gtsam.frontend.network_image import Placement
 from mvdyn_gtsam.frontend.point_shift import recover_shift
 from mvdyn_gtsam.geometry import pixel_rays
 
@@ -19,21 +20,23 @@ Size = tuple[int, int]
 
 
 def network_depth(
-    outputs: Outputs, adapter: DepthAdapter, canvas: Size, intrinsics: Array
+    outputs: Outputs, adapter: DepthAdapter, placement: Placement, intrinsics: Array
 ) -> tuple[Float32, Float32 | None]:
     """Depth ``(h, w)`` over the canvas, NaN where unknown, and confidence ``(h, w)`` in [0, 1] or None.
 
-    ``canvas`` is ``(width, height)`` of what the network saw and ``intrinsics (3, 3)`` belong to it; ``h``
-    and ``w`` are what the network gives. Raises ValueError, saying what it is, for an output that is no such
-    thing.
+    ``intrinsics (3, 3)`` are those of the canvas; ``h`` and ``w`` are what the network gives. Raises
+    ValueError, saying what it is, for an output that is no such thing.
     """
-    rule = adapter.depth
+    rule, canvas = adapter.depth, placement.canvas
     raw = outputs[rule.name]
     if raw.dtype.kind != "f" or not np.isfinite(raw).any():
         raise ValueError(f"gives no number in {rule.name}; export it in float32, or use another depth prior")
+    raw = raw.astype(np.float32)
     values = _points(raw, rule.name, rule.points_axis) if rule.value == "points" else _plane(raw, rule.name)
     shape = (values.shape[0], values.shape[1])
-    known = _known(outputs, adapter.validity, shape)
+    known = np.zeros(shape, bool)
+    inside = placement.inside(shape)
+    known[inside] = _known(outputs, adapter.validity, shape)[inside]
     focal = (intrinsics[0, 0] * shape[1] / canvas[0], intrinsics[1, 1] * shape[0] / canvas[1])
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what comes of it is unknown
         if rule.value == "points":

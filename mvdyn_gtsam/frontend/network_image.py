@@ -72,16 +72,23 @@ class Placement:
             result[block] = _interpolated(depth, rows.at(block), columns)
         return result
 
+    def inside(self, shape: tuple[int, ...]) -> tuple[slice, slice]:
+        """Rows and columns of a field of ``shape`` over the canvas that show the frame, not padding."""
+        bounds = []
+        for axis in (1, 0):
+            scale = shape[1 - axis] / self.canvas[axis]
+            first = int(np.ceil(self.offset[axis] * scale - 1e-9))
+            end = int(np.floor((self.offset[axis] + self.inner[axis]) * scale + 1e-9))
+            bounds.append(slice(first, max(first + 1, end)))
+        return bounds[0], bounds[1]
+
     def _positions(self, shape: tuple[int, ...], axis: int) -> _Positions:
         """Of the frame's columns (``axis`` 0) or rows in a field of ``shape``; none is in the padding."""
-        length = shape[1 - axis]
-        size, inner, canvas = self.frame[axis], self.inner[axis], self.canvas[axis]
-        scale = length / canvas
-        first = int(np.ceil(self.offset[axis] * scale - 1e-9))
-        last = max(first, int(np.floor((self.offset[axis] + inner) * scale + 1e-9)) - 1)
-        on_canvas = (np.arange(size) + 0.5) * (inner / size) + self.offset[axis]
+        scale = shape[1 - axis] / self.canvas[axis]
+        size, inside = self.frame[axis], self.inside(shape)[1 - axis]
+        on_canvas = (np.arange(size) + 0.5) * (self.inner[axis] / size) + self.offset[axis]
         # rounded, so that equal sizes are equal
-        position = np.clip(np.round(on_canvas * scale - 0.5, 6), first, last)
+        position = np.clip(np.round(on_canvas * scale - 0.5, 6), inside.start, inside.stop - 1)
         before = np.floor(position)
         return _Positions(
             before.astype(np.intp),

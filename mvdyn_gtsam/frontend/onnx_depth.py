@@ -95,7 +95,7 @@ class OnnxDepth:
         given = self._model.run(self._feeds(image, placement, seen_by), adapter.outputs, frame)
         try:
             outputs = dict(zip(adapter.outputs, given, strict=True))
-            depth, confidence = network_depth(outputs, adapter, placement.canvas, seen_by)
+            depth, confidence = network_depth(outputs, adapter, placement, seen_by)
         except ValueError as error:
             raise DepthPriorError(f"{self._path}: {frame}: {adapter.name} {error}") from error
         depth = placement.depth(depth)

@@ -15,6 +15,7 @@ import pytest
 
 import mvdyn_gtsam.pipeline
 from mvdyn_gtsam.cli.main import main
+from mvdyn_gtsam.frontend.depth_models import USABLE
 from mvdyn_gtsam.reconstruction import Reconstruction
 from tests.frontend.onnx_networks import MEAN, STD, depth_anything_v2
 from tests.tracking.synthetic_scene import Scene, two_cameras
@@ -160,3 +161,10 @@ def test_what_cannot_be_a_prior_is_one_line_before_any_work(
     code, said = run(capsys, capture, "--out", tmp_path / "o", *filled)
     assert code == 1 and len(said.splitlines()) == 1 and message in said
     assert not (tmp_path / "o").exists()
+
+
+def test_the_help_names_every_network(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in ("reconstruct", "batch"):
+        assert main([verb, "--help"]) == 0
+        said = "".join(capsys.readouterr().out.split())
+        assert all(name in said for name in USABLE)
