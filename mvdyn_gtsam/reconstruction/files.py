@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -27,7 +28,8 @@ def write_atomically(path: Path, content: bytes) -> None:
         temporary.write_bytes(content)
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # its folder may be no folder: the first error is the one to tell
+            temporary.unlink(missing_ok=True)
         raise _as_result_error(path, error) from error
     except BaseException:  # Ctrl-C between the two calls must not leave the temporary file behind
         temporary.unlink(missing_ok=True)
@@ -39,7 +41,7 @@ def _as_result_error(path: Path, error: OSError) -> ResultError:
         return ResultError(
             f"{path}: the disk is full; what was computed is kept: free space, then continue with --resume"
         )
-    return ResultError(f"{path}: cannot be written ({error.strerror or error}); choose another --out")
+    return ResultError(f"{path}: cannot be written ({error.strerror or error}); choose another place")
 
 
 def write_json(path: Path, value: Any) -> None:
