@@ -12,6 +12,7 @@ import numpy.typing as npt
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.reconstruction import Reconstruction
 from mvdyn_gtsam.reconstruction.files import write_atomically
+from mvdyn_gtsam.viewer.colours import colour_depth
 
 TILE_WIDTH = 256
 
@@ -29,7 +30,7 @@ def save_depth_sheet(
         depths = [reconstruction.depth(camera.name, time) for time in times]
         low, high = _depth_range(depths)
         images = [cv2.cvtColor(capture.read(index, time), cv2.COLOR_RGB2BGR) for time in times]
-        tiles = [colour_depth(depth, low, high) for depth in depths]
+        tiles = [cv2.cvtColor(colour_depth(depth, low, high), cv2.COLOR_RGB2BGR) for depth in depths]
         rows.append(np.hstack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]))
         rows.append(np.hstack([cv2.resize(tile, size, interpolation=cv2.INTER_NEAREST) for tile in tiles]))
     done, buffer = cv2.imencode(".png", np.vstack(rows))
@@ -37,18 +38,6 @@ def save_depth_sheet(
         raise RuntimeError("OpenCV could not encode the contact sheet")
     write_atomically(path, buffer.tobytes())
     return path
-
-
-def colour_depth(depth: npt.NDArray[np.float32], low: float, high: float) -> npt.NDArray[np.uint8]:
-    """Inverse depth ``(H, W)`` between depths ``low`` and ``high`` as BGR colours ``(H, W, 3)``."""
-    valid = np.isfinite(depth)
-    inverse = 1.0 / np.where(valid, depth, high)
-    shown = (inverse - 1.0 / high) / max(1.0 / low - 1.0 / high, 1e-12)
-    coloured = cv2.applyColorMap(
-        np.rint(np.clip(shown, 0.0, 1.0) * 255).astype(np.uint8), cv2.COLORMAP_PARULA
-    )
-    coloured[~valid] = 0
-    return np.asarray(coloured, dtype=np.uint8)
 
 
 def _depth_range(depths: Sequence[npt.NDArray[np.float32]]) -> tuple[float, float]:
