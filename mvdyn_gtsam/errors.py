@@ -31,3 +31,7 @@ class EvaluationError(MvdynError):
 
 class BaselineError(MvdynError):
     """A baseline (COLMAP, GLOMAP) failed to run."""
+
+
+class ViewerError(MvdynError):
+    """A result cannot be shown: the viewer's extra is missing, or its address cannot be used."""

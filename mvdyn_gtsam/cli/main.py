@@ -14,7 +14,7 @@ from typing import NoReturn
 from rich.console import Console
 from rich.logging import RichHandler
 
-from mvdyn_gtsam.cli import batch, compare, config, demo, evaluate, export, reconstruct, scene
+from mvdyn_gtsam.cli import batch, compare, config, demo, evaluate, export, reconstruct, scene, view
 from mvdyn_gtsam.errors import MvdynError
 from mvdyn_gtsam.memory import keep_freed_memory
 
@@ -29,13 +29,14 @@ EPILOG = """\
 start here:
   mvdyn demo                                     the bundled clip, end to end, scored
   mvdyn reconstruct CAPTURE --out OUT            your own capture
+  mvdyn view OUT --capture CAPTURE               look at it in 3D, in the browser
   mvdyn export OUT --format nerfstudio           for other tools
   mvdyn batch FOLDER --out OUT                   every capture of a folder
   mvdyn VERB --help                              every verb explains itself
 
 exit codes: 0 done, 1 failed (one line says why), 2 wrong command line, 3 a bug, 130 interrupted"""
 
-VERBS = (reconstruct, batch, evaluate, compare, export, demo, scene, config)
+VERBS = (reconstruct, batch, evaluate, compare, export, view, demo, scene, config)
 
 
 class _Parser(argparse.ArgumentParser):
