@@ -45,7 +45,7 @@ install: $(DEV_READY)
 
 # The stamps are touched last, so an interrupted installation is taken up again.
 $(DEMO_READY): $(INPUTS) | .venv/bin/python
-	$(PIP) --editable '.[eval]'
+	$(PIP) --editable '.[eval,view]'
 	@touch $@
 
 $(DEV_READY): $(INPUTS) | .venv/bin/python

@@ -21,7 +21,7 @@ SUMMARY = "look at a reconstruction in 3D, in the browser or in a file"
 DESCRIPTION = """\
 Look at a reconstruction in 3D: at every instant the points that each camera sees, the cameras with their
 images, and their paths. It is served to the browser until Ctrl-C, or with --save written to one HTML file
-that any browser opens and plays, without a server or a network.
+that a browser opens and plays, without a server or a network.
 With --capture points get the colours of the images, without it those of their depth.
 Needs the extra: pip install 'mvdyn_gtsam[view]'"""
 EPILOG = """\

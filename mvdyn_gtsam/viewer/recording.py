@@ -1,4 +1,4 @@
-"""A result as one HTML file: any browser opens it, turns it and plays it, without a server or a network."""
+"""A result as one HTML file: a browser opens and plays it, without a server or a network."""
 
 from __future__ import annotations
 

@@ -36,7 +36,6 @@ class Session:
         self._begun: tuple[int, bool] | None = None
         self._drawn: Choice | None = None
         self._last_frame = time.monotonic()
-        server.on_client_connect(lambda _: self._changed.set())
 
     def run(self) -> None:
         """Draw what is chosen until the thread is interrupted."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import OrderedDict
 from dataclasses import replace
 
@@ -22,8 +21,6 @@ from mvdyn_gtsam.viewer.pictures import (
     gathered_points,
 )
 from mvdyn_gtsam.viewer.scene import Scene, posed_times, read_scene, spread_times
-
-log = logging.getLogger(__name__)
 
 KEPT_INSTANTS = 8
 GATHERED_TIMES = 8
@@ -48,11 +45,6 @@ class ResultViews:
         self._frames: OrderedDict[tuple[bool, str, int], Frame] = OrderedDict()
         self._scenes: dict[tuple[int, bool], Scene] = {}
         self._background: tuple[Choice, Points] | None = None
-
-    @property
-    def name(self) -> str:
-        """Name of the capture."""
-        return self._result.name
 
     @property
     def frame_count(self) -> int:
