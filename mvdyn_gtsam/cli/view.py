@@ -95,6 +95,10 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
     views.check(choice)
     if capture is None:
         log.info("colours tell depth, near yellow; for those of the images name the capture with --capture")
+    placed = {name for group in views.groups for name in group}
+    for name in result.cameras:
+        if name not in placed:
+            log.warning("%s could not be placed and is not shown", name)
     if len(views.groups) > 1:
         groups = "; ".join(f"{index}: {', '.join(group)}" for index, group in enumerate(views.groups))
         log.info("no view connects these groups of cameras, shown is %d of %s", choice.group, groups)
@@ -111,6 +115,8 @@ def _check(arguments: argparse.Namespace) -> None:
     for option, value in (("--every", arguments.every), ("--points", arguments.points)):
         if value is not None and value < 1:
             raise ConfigError(f"{option} {value}: must be at least 1")
+    if not 0.0 <= arguments.min_confidence <= 1.0:
+        raise ConfigError(f"--min-confidence {arguments.min_confidence}: must be between 0 and 1")
     if arguments.every is not None and arguments.save is None:
         raise ConfigError("--every: says what --save writes; leave it out, or name a file with --save")
     if arguments.save is not None and arguments.save.suffix != ".html":

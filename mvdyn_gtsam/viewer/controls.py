@@ -13,6 +13,8 @@ from mvdyn_gtsam.viewer.views import ResultViews
 NOBODY = "no camera"
 REFINED, TRACKED = "refined", "tracked"
 THOUSAND = 1000
+FIRST_RATE = 10.0
+"""Frames per second that most machines draw."""
 
 
 class Controls:
@@ -52,7 +54,7 @@ class Controls:
             show=Show(self.show.value),
             colouring=Colouring(self.colouring.value),
             min_confidence=float(self.confidence.value),
-            points=int(self.points.value * THOUSAND),
+            points=round(self.points.value * THOUSAND),
             point_size=float(self.point_size.value),
             frustum_size=float(self.frustum_size.value),
             through=None if self.through.value == NOBODY else self.through.value,
@@ -95,7 +97,7 @@ class Controls:
             self.time = self._gui.add_slider("frame", 0, last, 1, min(choice.time, last))
             self.play = self._gui.add_checkbox("play", False)
             fastest = max(60.0, self._views.fps)
-            self.rate = self._gui.add_slider("frames a second", 1.0, fastest, 1.0, min(10.0, self._views.fps))
+            self.rate = self._gui.add_slider("frames a second", 0.5, fastest, 0.5, FIRST_RATE)
 
     def _add_points(self, choice: Choice) -> None:
         with self._gui.add_folder("points"):
@@ -111,8 +113,10 @@ class Controls:
                 initial_value=choice.colouring.value,
             )
             self.confidence = self._gui.add_slider("confidence from", 0.0, 1.0, 0.01, choice.min_confidence)
-            most = max(300.0, choice.points / THOUSAND)
-            self.points = self._gui.add_slider("thousands", 1.0, most, 1.0, choice.points / THOUSAND)
+            thousands = choice.points / THOUSAND
+            self.points = self._gui.add_slider(
+                "thousands", min(1.0, thousands), max(300.0, thousands), 1.0, thousands
+            )
             self.point_size = self._gui.add_slider("size", 0.2, 4.0, 0.1, choice.point_size)
 
     def _add_cameras(self, choice: Choice) -> None:

@@ -37,11 +37,11 @@ def check_address(host: str, port: int) -> None:
     if not 0 <= port <= 65535:
         raise ViewerError(f"--port {port}: ports are 0 to 65535; 0 takes any free one")
     try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as listener:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(address)
-            listener.listen(1)
+        for family, kind, _, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            with socket.socket(family, kind) as listener:
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                listener.bind(address)
+                listener.listen(1)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise ViewerError(

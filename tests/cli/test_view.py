@@ -76,6 +76,13 @@ def test_groups_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 
 
 @needs_viser
+def test_a_camera_in_no_group_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = make(tmp_path / "r", groups=(("cam0",),)).folder
+    code, _, err = run(capsys, result, "--save", tmp_path / "scene.html", "--every", 6)
+    assert code == 0 and "cam1 could not be placed and is not shown" in err and "cam0" not in err
+
+
+@needs_viser
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -89,6 +96,7 @@ def test_groups_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         ),
         (["{result}", "--save", "{tmp}/s.html", "--every", "0"], "--every 0: must be at least 1"),
         (["{result}", "--points", "0"], "--points 0: must be at least 1"),
+        (["{result}", "--min-confidence", "2"], "--min-confidence 2.0: must be between 0 and 1"),
         (["{result}", "--port", "99999"], "--port 99999: ports are 0 to 65535"),
     ],
 )

@@ -157,6 +157,16 @@ def test_groups_take_turns(server: viser.ViserServer, tmp_path: Path) -> None:
     assert session.controls.through.options == ("no camera", "cam1")
 
 
+@pytest.mark.parametrize("points", [1, 12_345, 1_000_000])
+def test_any_number_of_points_can_be_asked_for(
+    points: int, server: viser.ViserServer, tmp_path: Path
+) -> None:
+    session = Session(server, ResultViews(make(tmp_path / "r"), capture()), Choice(points=points))
+    session.step()
+    assert session.controls.read().points == points
+    assert points == 1 or "/cameras/cam0/points" in nodes(session)
+
+
 def test_a_result_of_one_frame_can_be_seen(server: viser.ViserServer, tmp_path: Path) -> None:
     views = ResultViews(make(tmp_path / "r"), None)
     views._result.manifest["capture"]["frame_count"] = 1
