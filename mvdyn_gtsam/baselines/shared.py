@@ -68,7 +68,7 @@ def shared_folder(database: Path, request: Request, info: CaptureInfo, version: 
     settings = request.settings
     content = {
         "capture": str(request.capture.resolve()),
-        "info": asdict(info),
+        "info": info.to_manifest(),
         "settings": settings.to_json(),
         "files": [_stamps(path) for path in (settings.masks, settings.descriptor) if path is not None],
         "pycolmap": version,

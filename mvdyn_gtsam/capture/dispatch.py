@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mvdyn_gtsam.capture.euroc import is_euroc, load_euroc
@@ -44,13 +45,15 @@ def open_capture(
         raise CaptureError(f"{path}: is a single file; give each video with --camera and its --intrinsics")
     if is_euroc(path):
         _refuse(path, "EuRoC", fps=fps, focal_mm=focal_mm)
-        return load_euroc(path, cameras=cameras, truncate=truncate)
+        return replace(load_euroc(path, cameras=cameras, truncate=truncate), source=path.absolute())
     if is_multicamvideo(path):
         _refuse(path, "MultiCamVideo", fps=fps)
-        return load_multicamvideo(path, cameras=cameras, focal_mm=focal_mm, truncate=truncate)
+        scene = load_multicamvideo(path, cameras=cameras, focal_mm=focal_mm, truncate=truncate)
+        return replace(scene, source=path.absolute())
     if is_folder_per_camera(path):
         _refuse(path, "folder-per-camera", focal_mm=focal_mm)
-        return load_folder_per_camera(path, cameras=cameras, fps=fps, truncate=truncate)
+        folders = load_folder_per_camera(path, cameras=cameras, fps=fps, truncate=truncate)
+        return replace(folders, source=path.absolute())
     raise CaptureError(f"{path}: not a capture; it must be {'; or '.join(LAYOUTS)}")
 
 

@@ -7,6 +7,7 @@ import json
 import logging
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,10 @@ def load_capture(source: Path, *, truncate: bool = False) -> Capture:
         Source(camera, open_media(entry["source"], path.parent, truncate))
         for camera, entry in zip(cameras, entries, strict=True)
     ]
-    return assemble_capture(name or path.parent.name, fps, sources, truncate=truncate, num_frames=num_frames)
+    capture = assemble_capture(
+        name or path.parent.name, fps, sources, truncate=truncate, num_frames=num_frames
+    )
+    return replace(capture, source=source.absolute())
 
 
 def capture_from_cameras(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -51,6 +52,8 @@ class Capture:
     streams: tuple[FrameStream, ...]
     start_time: float = 0.0
     """Seconds on the common clock of frame 0; not zero only where time offsets trimmed the start."""
+    source: Path | None = None
+    """The one file or folder that it was read from; None where there is none."""
 
     @property
     def frame_count(self) -> int:

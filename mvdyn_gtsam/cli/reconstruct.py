@@ -195,6 +195,6 @@ def summary(result: Reconstruction, seconds: float) -> list[str]:
         groups = "; ".join(", ".join(group) for group in result.groups)
         lines.append(f"no view connects these groups of cameras, each has a world frame of its own: {groups}")
     lines += [str(note) for note in result.manifest.get("notes", [])]
-    lines.append(f"next: mvdyn view {result.folder} --capture CAPTURE, to look at it in 3D")
+    lines.append(f"next: mvdyn view {result.folder}, to look at it in 3D")
     lines.append(f"      mvdyn export {result.folder} --format nerfstudio|colmap|ply|tum")
     return lines

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from mvdyn_gtsam.errors import ConfigError, ViewerError
+from mvdyn_gtsam.errors import ConfigError, MvdynError, ViewerError
 
 if TYPE_CHECKING:
+    from mvdyn_gtsam.capture import Capture
+    from mvdyn_gtsam.reconstruction import Reconstruction
     from mvdyn_gtsam.viewer.pictures import Choice
     from mvdyn_gtsam.viewer.views import ResultViews
 
@@ -22,13 +24,15 @@ DESCRIPTION = """\
 Look at a reconstruction in 3D: at every instant the points that each camera sees, the cameras with their
 images, and their paths. It is served to the browser until Ctrl-C, or with --save written to one HTML file
 that a browser opens and plays, without a server or a network.
-With --capture points get the colours of the images, without it those of their depth.
+Points have the colours of the images while the capture is where it was, or where --capture says; otherwise
+those of their depth.
 Needs the extra: pip install 'mvdyn_gtsam[view]'"""
 EPILOG = """\
 examples:
-  mvdyn view result --capture clip
-  mvdyn view result --capture clip --save scene.html               # to copy from a server and open
-  mvdyn view result --capture clip --save scene.html --show gathered --every 2"""
+  mvdyn view result
+  mvdyn view result --save scene.html                              # to copy from a server and open
+  mvdyn view result --save scene.html --show gathered --every 2
+  mvdyn view result --capture moved/clip"""
 
 SHOWS = ("all", "moving", "still", "gathered")
 POINTS_SERVED, POINTS_SAVED = 100_000, 40_000
@@ -41,7 +45,7 @@ log = logging.getLogger(__name__)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the verb."""
     parser.add_argument("reconstruction", type=Path, metavar="OUT", help="folder of a reconstruction")
-    parser.add_argument("--capture", type=Path, help="the capture it was made from, for images and colours")
+    parser.add_argument("--capture", type=Path, help="the capture it was made from, where it was moved since")
     parser.add_argument("--host", default="127.0.0.1", help="address to serve at (default: %(default)s)")
     parser.add_argument("--port", type=int, default=8080, help="0 takes any free one (default: %(default)s)")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write FILE.html instead of serving")
@@ -83,18 +87,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, messages: Console) -> int:
     """Run the verb."""
     _check(arguments)
-    from mvdyn_gtsam.capture import open_capture
     from mvdyn_gtsam.reconstruction import Reconstruction
     from mvdyn_gtsam.viewer.views import ResultViews
 
     result = Reconstruction.load(arguments.reconstruction)
-    # Longer captures are cut to what was reconstructed, so length is not checked again here.
-    capture = None if arguments.capture is None else open_capture(arguments.capture, truncate=True)
+    capture = _capture(arguments.capture, result)
     views = ResultViews(result, capture)
     choice = _choice(arguments, views)
     views.check(choice)
-    if capture is None:
-        log.info("colours tell depth, near yellow; for those of the images name the capture with --capture")
     placed = {name for group in views.groups for name in group}
     for name in result.cameras:
         if name not in placed:
@@ -121,6 +121,26 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ConfigError("--every: says what --save writes; leave it out, or name a file with --save")
     if arguments.save is not None and arguments.save.suffix != ".html":
         raise ConfigError(f"--save {arguments.save}: the file is for a browser; end its name in .html")
+
+
+def _capture(given: Path | None, result: Reconstruction) -> Capture | None:
+    """The capture that was ``given``, or the one the result was made from where it still is."""
+    from mvdyn_gtsam.capture import open_capture
+    from mvdyn_gtsam.reconstruction.export.points import check_capture
+
+    # Longer captures are cut to what was reconstructed, so length is not checked again here.
+    if given is not None:
+        return open_capture(given, truncate=True)
+    source = result.capture_source
+    if source is not None and source.exists():
+        try:
+            capture = open_capture(source, truncate=True)
+            check_capture(result, capture)
+            return capture
+        except MvdynError as error:  # nobody asked for it: the result is shown without
+            log.warning("%s", error)
+    log.info("colours tell depth, near yellow; for those of the images name the capture with --capture")
+    return None
 
 
 def _choice(arguments: argparse.Namespace, views: ResultViews) -> Choice:

@@ -57,6 +57,8 @@ class CaptureInfo:
     cameras: tuple[Camera, ...]
     first_frame_crc32: tuple[int, ...] = ()
     """Per camera, of the first frame's pixels; tells a resumed run that it reads the same videos."""
+    source: str | None = None
+    """File or folder of the capture; it may be moved, and tells no captures apart."""
 
     @staticmethod
     def from_capture(capture: Capture) -> CaptureInfo:
@@ -64,11 +66,14 @@ class CaptureInfo:
         checksums = tuple(
             zlib.crc32(capture.read(index, 0).tobytes()) for index in range(len(capture.cameras))
         )
-        return CaptureInfo(capture.name, capture.fps, capture.frame_count, capture.cameras, checksums)
+        source = None if capture.source is None else str(capture.source)
+        return CaptureInfo(capture.name, capture.fps, capture.frame_count, capture.cameras, checksums, source)
 
     def to_manifest(self) -> dict[str, Any]:
         """The ``capture`` entry of the manifest, as plain JSON values."""
-        return json.loads(json.dumps(asdict(self)))
+        entry: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        del entry["source"]
+        return entry
 
 
 def new_manifest(capture_info: CaptureInfo, config: Mapping[str, Any], unit: str) -> dict[str, Any]:
@@ -83,6 +88,7 @@ def new_manifest(capture_info: CaptureInfo, config: Mapping[str, Any], unit: str
         "unit": unit,
         "conventions": CONVENTIONS,
         "capture": capture_info.to_manifest(),
+        "capture_source": capture_info.source,
         "groups": [],
         "stages": [],
         "notes": [],

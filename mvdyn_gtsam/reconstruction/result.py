@@ -58,6 +58,12 @@ class Reconstruction:
         return str(self.manifest["capture"]["name"])
 
     @property
+    def capture_source(self) -> Path | None:
+        """File or folder of the capture, where it was when the run was last begun; None where not known."""
+        source = self.manifest.get("capture_source")
+        return None if source is None else Path(source)
+
+    @property
     def frame_count(self) -> int:
         """Frames per camera."""
         return int(self.manifest["capture"]["frame_count"])

@@ -87,7 +87,7 @@ class ReconstructionWriter:
             _remove_outdated(folder, manifest, fresh)
             manifest.update(
                 status=Status.RUNNING.value,
-                **{key: fresh[key] for key in ("config", "versions", "depth_prior")},
+                **{key: fresh[key] for key in ("config", "versions", "depth_prior", "capture_source")},
             )
         else:
             if is_reconstruction(folder):

@@ -11,7 +11,7 @@ import pytest
 
 from mvdyn_gtsam.cli.main import main
 from mvdyn_gtsam.cli.view import SHOWS
-from tests.viewer.results import make
+from tests.viewer.results import make, write_capture
 
 needs_viser = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None, reason="viser, of the view extra, is not installed"
@@ -41,6 +41,23 @@ def test_a_page_is_saved(result: Path, tmp_path: Path, capsys: pytest.CaptureFix
     (result / "depth" / "cam0" / "000000.png").write_bytes(b"")
     code, _, err = run(capsys, result, "--save", page)
     assert code == 1 and "000000.png: damaged" in err and page.read_bytes() == before
+
+
+@needs_viser
+def test_the_capture_is_found_where_it_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clip = write_capture(tmp_path / "clip")
+    result = make(tmp_path / "r", source=clip).folder
+    words = ["--save", tmp_path / "scene.html", "--every", 6]
+    code, _, err = run(capsys, result, *words)
+    assert code == 0 and "colours tell depth" not in err
+    (clip / "cam1" / "000005.png").unlink()
+    code, _, err = run(capsys, result, *words)
+    assert code == 0 and "was not made from capture 'clip'" in err and "colours tell depth" in err
+    clip.rename(tmp_path / "moved")
+    code, _, err = run(capsys, result, *words)
+    assert code == 0 and "colours tell depth" in err
+    code, _, err = run(capsys, result, "--capture", tmp_path / "moved", *words)
+    assert code == 1 and "was not made from capture 'clip'" in err
 
 
 @needs_viser

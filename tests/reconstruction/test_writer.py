@@ -201,6 +201,15 @@ def test_resume_refuses_another_capture(tmp_path: Path) -> None:
         ReconstructionWriter.create(tmp_path, other, CONFIG, resume=True)
 
 
+def test_resume_notes_where_the_capture_is_now(tmp_path: Path) -> None:
+    for place in ("before", "after", None):
+        info = dataclasses.replace(capture_info(), source=place)
+        with ReconstructionWriter.create(tmp_path, info, CONFIG, resume=True):
+            pass
+        found = Reconstruction.load(tmp_path).capture_source
+        assert found == (None if place is None else Path(place))
+
+
 def test_resume_keeps_finished_depth_and_notes_the_settings_of_what_comes(tmp_path: Path) -> None:
     write_complete(tmp_path)
     now = {"tracking": {"window": 25, "new": 1}, "refinement": {"iterations": 3}}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -63,11 +65,32 @@ def motion_at(camera: Camera, time: int) -> np.ndarray:
     return motion
 
 
+def write_capture(folder: Path) -> Path:
+    """The frames of ``capture`` as a capture folder."""
+    for number, camera in enumerate(CAMERAS):
+        (folder / camera.name).mkdir(parents=True)
+        for time in range(FRAMES):
+            image = Gradient(camera, number).read(time)
+            assert cv2.imwrite(str(folder / camera.name / f"{time:06d}.png"), image[..., ::-1])
+    cameras = [
+        {key: getattr(camera, key) for key in ("name", "width", "height", "fx", "fy", "cx", "cy")}
+        | {"source": f"{camera.name}/*.png"}
+        for camera in CAMERAS
+    ]
+    (folder / "capture.json").write_text(json.dumps({"name": "clip", "fps": FPS, "cameras": cameras}))
+    return folder
+
+
 def make(
-    folder: Path, *, refined: bool = True, groups: Sequence[Sequence[str]] = (("cam0", "cam1"),)
+    folder: Path,
+    *,
+    refined: bool = True,
+    groups: Sequence[Sequence[str]] = (("cam0", "cam1"),),
+    source: Path | None = None,
 ) -> Reconstruction:
     """Confidence is 0.2 in the left half, 1 in the right; what tracking said is twice as deep."""
-    with ReconstructionWriter.create(folder, CaptureInfo("clip", FPS, FRAMES, CAMERAS), {}) as writer:
+    info = CaptureInfo("clip", FPS, FRAMES, CAMERAS, source=None if source is None else str(source))
+    with ReconstructionWriter.create(folder, info, {}) as writer:
         writer.set_groups(groups)
         _write(writer, 2.0 if refined else 1.0, refined=False)
         writer.finish_stage("tracking", 1.0)
