@@ -37,14 +37,14 @@ class LiftConfig:
     """Lowe's ratio between cameras. Source: Lowe 2004."""
     apart_px: float = 4.0
     """Keypoints nearer than this are one seen from several directions, and no rivals. Source: choice."""
-    minimum_trust: float = 0.9
+    minimum_trust: float = 0.85
     """Share of favourable testimony a placement needs, unless no other is near it in matches. Source:
-    experiments/start_variants.py; see ``ClassicalInitializer``."""
+    experiments/placement_trust.py; see ``ClassicalInitializer``."""
     minimum_inliers: int = 20
     """Matches that must support it. Source: as above; a true one with 12 ended up 2.5 degrees off."""
-    minimum_share: float = 0.4
-    """Share of the comparable surface that has to agree. Source: as above; false placements with that much
-    trust had up to 0.33, unless the true one, which then led, was among them."""
+    minimum_share: float = 0.3
+    """Share of the comparable surface that has to agree. Source: as above; true ones with enough trust had
+    0.30 and more."""
 
     def __post_init__(self) -> None:
         if self.tilted_frames < 0 or self.tilted_features < 1:

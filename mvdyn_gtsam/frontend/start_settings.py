@@ -43,9 +43,13 @@ class WideBaselineConfig:
     """Share of its dense frames for which a map must know depth to be placed. Source: experiments/
     start_variants.py; maps with 0.07 to 0.09 were 7 % off and more, and one was placed wrong; others had 0.22
     and more."""
-    minimum_trust: float = 0.8
-    """Share of favourable testimony a mended placement needs. Source: experiments/start_variants.py; true
-    ones had 0.78 to 0.99, false ones up to 0.77 where no true one beat them."""
+    clear_trust: float = 0.8
+    """Share of favourable testimony, in haste, that a placement needs to be believed as it is. Source:
+    experiments/start_variants.py."""
+    minimum_trust: float = 0.75
+    """And the careful share that a mended one needs. Source: experiments/placement_trust.py; true ones had
+    0.77 and more, but for those of maps that were bent too far, false ones up to 0.73 where no true one beat
+    them."""
     minimum_agreement: float = 0.01
     """Agreeing share of the image per frame pair it needs. Source: as above; true ones had 0.017 and more."""
     lift: LiftConfig = field(default_factory=LiftConfig)

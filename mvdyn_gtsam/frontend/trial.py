@@ -63,16 +63,30 @@ def try_placement(
 
     ``same_point``: ``(M, 2)`` rows of the maps' points that are one.
     """
+    aSb, moved = mend_placement(cameras, maps, aSb, same_point, adjustment, trial, dense_map)
+    verdict = verify_placement(
+        moved[0].views, moved[1].views, Similarity.identity(), verification, careful=True
+    )
+    return aSb, verdict
+
+
+def mend_placement(
+    cameras: tuple[Camera, Camera],
+    maps: tuple[DenseMap, DenseMap],
+    aSb: Similarity,
+    same_point: Index,
+    adjustment: AdjustmentConfig,
+    trial: TrialConfig,
+    dense_map: DenseMapConfig,
+) -> tuple[Similarity, tuple[DenseMap, DenseMap]]:
+    """The placement ``aSb`` as a short joint adjustment mends it, and both maps in one world after that."""
     short = replace(adjustment, points_per_camera=trial.points_per_camera, search_px=trial.search_px)
     sparse = [dense.sparse for dense in maps]
     frames = adjust_maps(cameras, sparse, {0: Similarity.identity(), 1: aSb}, [(0, 1, same_point)], short)
     wTc = {index: np.stack([frame.wTc for frame in own]) for index, own in frames.items()}
-    moved = [move_map(cameras[i], maps[i], wTc[i], dense_map) for i in (0, 1)]
-    verdict = verify_placement(
-        moved[0].views, moved[1].views, Similarity.identity(), verification, careful=True
-    )
     wSa, wSb = (similarity_of(sparse[i].mTc, wTc[i]) for i in (0, 1))
-    return wSa.inverse().compose(wSb), verdict
+    first, second = (move_map(cameras[i], maps[i], wTc[i], dense_map) for i in (0, 1))
+    return wSa.inverse().compose(wSb), (first, second)
 
 
 def similarity_of(mTc: Array, wTc: Array) -> Similarity:

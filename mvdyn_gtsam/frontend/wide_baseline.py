@@ -66,6 +66,8 @@ class Candidate:
     placement: Placement
     inliers: int
     """Matches that support it."""
+    support: float
+    """What they explain, as of ``Hypothesis``."""
     alone: bool
     """Whether they support it ``NEAR`` times as well as any other."""
 
@@ -259,18 +261,18 @@ class ClassicalInitializer:
 
         Lifted keypoints propose more, so more that is false: patterns that repeat agree wherever they are
         shifted to. What could be compared has to agree, and so has nearly all of the testimony, unless the
-        matches leave no other choice.
+        matches and the trials leave no other choice.
         """
         config = self.config
-        candidates = [
-            candidate
-            for candidate in self._likely(capture, first, second, matches)
-            if candidate.inliers >= config.lift.minimum_inliers
-        ]
+        likely = self._likely(capture, first, second, matches)
+        enough = [c for c in likely if c.inliers >= config.lift.minimum_inliers][: config.trial.trials]
+        mended = [self._tried(capture, first, second, matches, c.placement) for c in enough]
+        untried = [(c, c.placement) for c in likely if not any(c is one for one in enough)]
+        rivals = [*zip(enough, mended, strict=True), *untried]
         found: list[Placement] = []
-        for candidate in candidates[: config.trial.trials]:
-            tried = self._tried(capture, first, second, matches, candidate.placement)
-            trust = config.minimum_trust if candidate.alone else config.lift.minimum_trust
+        for candidate, tried in zip(enough, mended, strict=True):
+            alone = candidate.alone or _stands_alone(candidate, tried, rivals)
+            trust = config.minimum_trust if alone else config.lift.minimum_trust
             if self._believed(tried.verdict, trust) and tried.verdict.share >= config.lift.minimum_share:
                 found.append(tried)
         return sorted(found, key=lambda placement: -balance(placement.verdict))[:1]
@@ -291,7 +293,8 @@ class ClassicalInitializer:
             if verdict.trust >= config.trial.minimum_trust:
                 rivals = [h.support for h in hypotheses if not same_placement(h.aSb, hypothesis.aSb)]
                 alone = hypothesis.support >= NEAR * max(rivals, default=0.0)
-                likely.append(Candidate(Placement(a, b, hypothesis.aSb, verdict), hypothesis.inliers, alone))
+                placement = Placement(a, b, hypothesis.aSb, verdict)
+                likely.append(Candidate(placement, hypothesis.inliers, hypothesis.support, alone))
         return sorted(likely, key=lambda candidate: -balance(candidate.placement.verdict))
 
     def _tried(
@@ -328,7 +331,7 @@ class ClassicalInitializer:
 
     def _clear(self, likely: Sequence[Placement]) -> bool:
         """Whether the first is to be believed as it is, and no other comes near it: no need for trials."""
-        if not likely or not self._believed(likely[0].verdict, self.config.minimum_trust):
+        if not likely or not self._believed(likely[0].verdict, self.config.clear_trust):
             return False
         return all(NEAR * balance(other.verdict) < balance(likely[0].verdict) for other in likely[1:])
 
@@ -340,6 +343,21 @@ class ClassicalInitializer:
             return balance(verdict)
 
         return judge
+
+
+def _stands_alone(
+    candidate: Candidate, tried: Placement, rivals: Sequence[tuple[Candidate, Placement]]
+) -> bool:
+    """Whether the matches support a candidate ``NEAR`` times as well as any rival, all as trials left them.
+
+    What ended up in the same place, or with more against it than for it, is no rival.
+    """
+    return all(
+        candidate.support >= NEAR * other.support
+        or same_placement(tried.aSb, placement.aSb)
+        or balance(placement.verdict) <= 0.0
+        for other, placement in rivals
+    )
 
 
 def _is_news(placement: Placement, believed: Sequence[Placement]) -> bool:

@@ -84,6 +84,34 @@ def test_a_fine_pattern_is_not_held_against_a_depth_within_tolerance() -> None:
     assert careful.agreement == hasty.agreement
 
 
+def test_far_aside_more_depths_find_where_surfaces_look_the_same() -> None:
+    """Depth that is 3 % off moves a texture by several times its grain; a wrong surface stays wrong."""
+    grid = Grid.covering(WIDTH, HEIGHT, STRIDE)
+    intrinsics = camera("any").intrinsics
+    random = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(random.uniform(0.0, 255.0, (HEIGHT, 4 * WIDTH)), (0, 0), 1.0)
+    texture = (100.0 + texture - texture.mean()).astype(np.float32)
+
+    def seen_from(x: float, wall: np.ndarray) -> DepthView:
+        shift, first = np.eye(4), round(x * intrinsics[0, 0] / 2.0)
+        shift[0, 3] = x
+        depth = np.full(len(grid), 2.0 * 1.03)
+        return DepthView(0, shift, intrinsics, grid, depth, wall[:, first : first + WIDTH].copy())
+
+    one, beside = seen_from(0.0, texture), seen_from(1.5, texture)
+    other = seen_from(1.5, texture[::-1])
+    few, many = replace(CONFIG, looks=2), replace(CONFIG, looks=10)
+    true, false = (
+        [
+            verify_placement([one], [view], Similarity.identity(), config, careful=True).contradiction
+            for config in (few, many)
+        ]
+        for view in (beside, other)
+    )
+    assert true[0] > 0.1 and true[1] < 0.2 * true[0]
+    assert false[1] > 3.0 * true[1]
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -145,3 +173,7 @@ def test_the_order_of_the_cameras_does_not_matter(views_a: list[DepthView], view
 def test_nonsense_is_refused() -> None:
     with pytest.raises(ConfigError, match="agree"):
         VerificationConfig(agree=0.2, conflict=0.1)
+    with pytest.raises(ConfigError, match="looks is 3"):
+        VerificationConfig(looks=3)
+    with pytest.raises(ConfigError, match="other_look_careful"):
+        VerificationConfig(other_look_careful=0.7)

@@ -22,6 +22,7 @@ from mvdyn_gtsam.frontend.start_settings import WideBaselineConfig
 from mvdyn_gtsam.frontend.verification import Verdict
 from mvdyn_gtsam.frontend.wide_baseline import Candidate, ClassicalInitializer
 from mvdyn_gtsam.geometry import Similarity, rotation_angle_deg
+from tests.frontend.synthetic_maps import similarity
 from tests.tracking.synthetic_scene import Scene, two_cameras
 
 
@@ -88,11 +89,16 @@ class Judged(ClassicalInitializer):
 
     inliers = 40
 
-    def __init__(self, candidates: list[tuple[Verdict, bool]]) -> None:
+    def __init__(self, candidates: list[tuple[Verdict, bool]], apart: float = 1.0) -> None:
         super().__init__(DisFlow())
         self.candidates = [
-            Candidate(Placement(0, 1, Similarity.identity(), verdict), self.inliers, alone)
-            for verdict, alone in candidates
+            Candidate(
+                Placement(0, 1, similarity(1.0, (0.0, 0.0, 0.0), (apart * number, 0.0, 0.0)), verdict),
+                self.inliers,
+                20.0,
+                alone,
+            )
+            for number, (verdict, alone) in enumerate(candidates)
         ]
 
     def _likely(self, *_: object) -> list[Candidate]:
@@ -103,22 +109,30 @@ class Judged(ClassicalInitializer):
         return placement
 
 
-def judged(*candidates: tuple[Verdict, bool]) -> list[Verdict]:
-    start = Judged(list(candidates))
+def judged(*candidates: tuple[Verdict, bool], apart: float = 1.0) -> list[Verdict]:
+    start = Judged(list(candidates), apart)
     capture, dense, matches = (None,) * 3
     return [placement.verdict for placement in start._place_lifted(capture, dense, dense, matches)]  # type: ignore[arg-type]
 
 
 def test_a_second_look_asks_for_more_unless_the_matches_leave_no_choice() -> None:
-    sure, fair, doubtful = (Verdict(a, c, 10, 5.0) for a, c in ((4.0, 0.1), (4.0, 0.7), (4.0, 1.5)))
-    assert judged((sure, False)) == [sure]
-    assert judged((fair, False)) == []
-    assert judged((fair, True)) == [fair]
+    sure, fair, doubtful = (Verdict(a, c, 10, 5.0) for a, c in ((4.0, 0.1), (4.0, 0.9), (4.0, 1.5)))
+    rival = Verdict(2.0, 1.5, 10, 5.0)
+    assert judged((sure, False), (rival, False)) == [sure]
+    assert judged((fair, False), (rival, False)) == []
+    assert judged((fair, True), (rival, False)) == [fair]
     assert judged((doubtful, True)) == []
     # a pattern that repeats: little of what could be compared agrees
-    assert judged((replace(sure, comparable=12.0), True)) == []
+    assert judged((replace(sure, comparable=16.0), True)) == []
     # next to nothing to go by
     assert judged((Verdict(0.05, 0.0, 10, 0.06), True)) == []
+
+
+def test_what_trials_refute_or_bring_to_the_same_place_is_no_rival() -> None:
+    fair, rival, refuted = Verdict(4.0, 0.9, 10, 5.0), Verdict(2.0, 1.5, 10, 5.0), Verdict(2.0, 2.5, 10, 5.0)
+    assert judged((fair, False), (rival, False)) == []
+    assert judged((fair, False), (refuted, False)) == [fair]
+    assert judged((fair, False), (rival, False), apart=0.01) == [fair]
 
 
 def test_a_second_look_needs_matches_enough_to_place_by(monkeypatch: pytest.MonkeyPatch) -> None:
