@@ -123,7 +123,7 @@ def test_a_second_look_asks_for_more_unless_the_matches_leave_no_choice() -> Non
     assert judged((fair, True), (rival, False)) == [fair]
     assert judged((doubtful, True)) == []
     # a pattern that repeats: little of what could be compared agrees
-    assert judged((replace(sure, comparable=16.0), True)) == []
+    assert judged((replace(sure, comparable=12.0), True)) == []
     # next to nothing to go by
     assert judged((Verdict(0.05, 0.0, 10, 0.06), True)) == []
 
