@@ -14,7 +14,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -23,18 +22,16 @@ import numpy as np
 
 from experiments.altered_captures import AlteredCapture, alter_capture
 from experiments.records import (
-    ExperimentError,
     Page,
     Run,
     experiment_parser,
     figure,
-    key_of,
     parse,
     run_experiment,
     table,
 )
-from experiments.start_variants import VARIANTS, CaptureVariant, folders_of
-from mvdyn_gtsam.config import load_config, to_dict
+from experiments.start_variants import VARIANTS, CaptureVariant, folders_of, variant_runs
+from mvdyn_gtsam.config import load_config
 from mvdyn_gtsam.frontend.camera_maps import map_camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow
 from mvdyn_gtsam.frontend.dense_map import DenseMap, testimony_flow
@@ -212,24 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(parser, words)
 
     def plan() -> list[Run]:
-        config = load_config(None, options.overrides)
-        chosen = [v for v in VARIANTS if options.only is None or any(w in v.name for w in options.only)]
-        if not chosen:
-            raise ExperimentError(f"--only {' '.join(options.only)}: no variant is called so")
-        return [
-            Run(
-                label=variant.name,
-                key=key_of(
-                    variant=variant.name,
-                    parts={"parts": [asdict(part) for part in variant.parts]},
-                    settings=to_dict(config)["frontend"],
-                    judged=JUDGED,
-                ),
-                measure=partial(measure, variant, options.overrides, options.work / "scenes"),
-                again=options.again,
-            )
-            for variant in chosen
-        ]
+        return variant_runs(options, VARIANTS, measure, judged=JUDGED)
 
     pages = [Page(options.results / f"{NAME}.md", "Trust in true and false placements", render)]
     return run_experiment(NAME, words, options.results / f"{NAME}.json", pages, plan)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -339,33 +339,44 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
+def variant_runs(
+    options: argparse.Namespace,
+    variants: Sequence[CaptureVariant],
+    measure: Callable[[CaptureVariant, Sequence[str], Path], dict[str, Any]],
+    **key: Any,
+) -> list[Run]:
+    """A run per variant that ``options.only`` leaves; ``key``: what else an entry of the records depends on.
+
+    Raises ExperimentError where it leaves none.
+    """
+    config = load_config(None, options.overrides)
+    chosen = [v for v in variants if options.only is None or any(word in v.name for word in options.only)]
+    if not chosen:
+        raise ExperimentError(f"--only {' '.join(options.only)}: no variant is called so")
+    return [
+        Run(
+            label=variant.name,
+            key=key_of(
+                variant=variant.name,
+                parts={"parts": [asdict(part) for part in variant.parts]},
+                settings=to_dict(config)["frontend"],
+                **key,
+            ),
+            measure=partial(measure, variant, options.overrides, options.work / "scenes"),
+            again=options.again,
+        )
+        for variant in chosen
+    ]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, print the table, write it."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     options = parse(parser(), words)
 
     def plan() -> list[Run]:
-        config = load_config(None, options.overrides)
-        chosen = [
-            variant
-            for variant in (random_variants(*options.random) if options.random else VARIANTS)
-            if options.only is None or any(word in variant.name for word in options.only)
-        ]
-        if not chosen:
-            raise ExperimentError(f"--only {' '.join(options.only)}: no variant is called so")
-        return [
-            Run(
-                label=variant.name,
-                key=key_of(
-                    variant=variant.name,
-                    parts={"parts": [asdict(part) for part in variant.parts]},
-                    settings=to_dict(config)["frontend"],
-                ),
-                measure=partial(measure, variant, options.overrides, options.work / "scenes"),
-                again=options.again,
-            )
-            for variant in chosen
-        ]
+        variants = random_variants(*options.random) if options.random else VARIANTS
+        return variant_runs(options, variants, measure)
 
     pages = [Page(options.results / f"{options.name}.md", "The start on altered captures", render)]
     return run_experiment(NAME, words, options.results / f"{NAME}.json", pages, plan)
