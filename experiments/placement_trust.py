@@ -32,20 +32,20 @@ from experiments.records import (
 )
 from experiments.start_variants import VARIANTS, CaptureVariant, folders_of, variant_runs
 from mvdyn_gtsam.config import load_config
-from mvdyn_gtsam.frontend.camera_maps import map_camera
 from mvdyn_gtsam.frontend.dense_flow import DisFlow
-from mvdyn_gtsam.frontend.dense_map import DenseMap, testimony_flow
-from mvdyn_gtsam.frontend.lifted_points import lift_map, match_lifted
-from mvdyn_gtsam.frontend.placement import (
+from mvdyn_gtsam.frontend.start.camera_maps import map_camera
+from mvdyn_gtsam.frontend.start.dense_map import DenseMap, testimony_flow
+from mvdyn_gtsam.frontend.start.lifted_points import lift_map, match_lifted
+from mvdyn_gtsam.frontend.start.placement import (
     PointMatches,
     agreeing_pairs,
     match_maps,
     propose_placements,
     same_placement,
 )
-from mvdyn_gtsam.frontend.start_settings import WideBaselineConfig
-from mvdyn_gtsam.frontend.trial import mend_placement, similarity_of
-from mvdyn_gtsam.frontend.verification import VerificationConfig, verify_placement
+from mvdyn_gtsam.frontend.start.settings import WideBaselineConfig
+from mvdyn_gtsam.frontend.start.trial import mend_placement, similarity_of
+from mvdyn_gtsam.frontend.start.verification import VerificationConfig, verify_placement
 from mvdyn_gtsam.geometry import Similarity, rotation_angle_deg
 
 NAME = "placement_trust"

@@ -47,7 +47,7 @@ from mvdyn_gtsam.errors import BaselineError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from mvdyn_gtsam.frontend.start import Start
+    from mvdyn_gtsam.frontend.start.model import Start
 
 Placed = tuple[list[list[str]], Mapping[str, Frames], float]
 """Groups of cameras, their placed frames, and the seconds it took."""
@@ -61,8 +61,8 @@ GOAL_SHARE = 0.03
 def run_classical(capture: Capture, config: Config) -> Placed:
     """Groups, placed frames and seconds of the classical start."""
     from mvdyn_gtsam.frontend.dense_flow import DisFlow
-    from mvdyn_gtsam.frontend.dense_map import testimony_flow
-    from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer
+    from mvdyn_gtsam.frontend.start.dense_map import testimony_flow
+    from mvdyn_gtsam.frontend.start.wide_baseline import ClassicalInitializer
 
     began = time.perf_counter()
     flow = DisFlow(testimony_flow(config.frontend.flow))
@@ -73,7 +73,7 @@ def run_classical(capture: Capture, config: Config) -> Placed:
 def read_kept(capture: Capture, work: Path) -> Placed:
     """The start that experiments.accuracy left in ``work``. Raises TrackingError where it has none."""
     from mvdyn_gtsam.errors import TrackingError
-    from mvdyn_gtsam.frontend.start import start_from_arrays
+    from mvdyn_gtsam.frontend.start.model import start_from_arrays
     from mvdyn_gtsam.reconstruction import Reconstruction
 
     folder = work / capture.name / "ours" / "ours"

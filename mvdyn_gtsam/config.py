@@ -24,7 +24,7 @@ from mvdyn_gtsam.config_tree import (
 )
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.dense_flow import FlowConfig
-from mvdyn_gtsam.frontend.start_settings import WideBaselineConfig
+from mvdyn_gtsam.frontend.start.settings import WideBaselineConfig
 from mvdyn_gtsam.refinement.settings import RefinementConfig
 
 

@@ -16,15 +16,15 @@ import numpy as np
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import Config, to_dict
 from mvdyn_gtsam.errors import ResultError
-from mvdyn_gtsam.frontend.aligned_prior import AlignedPrior, align_to_start
 from mvdyn_gtsam.frontend.dense_depth import upsample_depth
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow, DisFlow, FlowConfig
-from mvdyn_gtsam.frontend.dense_map import testimony_flow
-from mvdyn_gtsam.frontend.depth_prior import DepthPrior, NoDepthPrior
-from mvdyn_gtsam.frontend.predictions import Predictions
-from mvdyn_gtsam.frontend.start import Start, start_from_arrays, start_to_arrays
+from mvdyn_gtsam.frontend.depth_priors.aligned_prior import AlignedPrior, align_to_start
+from mvdyn_gtsam.frontend.depth_priors.depth_prior import DepthPrior, NoDepthPrior
+from mvdyn_gtsam.frontend.depth_priors.predictions import Predictions
+from mvdyn_gtsam.frontend.start.dense_map import testimony_flow
+from mvdyn_gtsam.frontend.start.model import Start, start_from_arrays, start_to_arrays
+from mvdyn_gtsam.frontend.start.wide_baseline import ClassicalInitializer, WideBaselineInitializer
 from mvdyn_gtsam.frontend.threads import in_order
-from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer, WideBaselineInitializer
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction import CaptureInfo, Reconstruction, ReconstructionWriter
 from mvdyn_gtsam.resuming import RunConfig, configure, resumed_prior

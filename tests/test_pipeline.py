@@ -22,8 +22,8 @@ from mvdyn_gtsam.config import Config, load_config
 from mvdyn_gtsam.demo import demo_capture
 from mvdyn_gtsam.errors import DepthPriorError, ResultError
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, Float32, Image
-from mvdyn_gtsam.frontend.depth_prior import NoDepthPrior
-from mvdyn_gtsam.frontend.start import Start
+from mvdyn_gtsam.frontend.depth_priors.depth_prior import NoDepthPrior
+from mvdyn_gtsam.frontend.start.model import Start
 from mvdyn_gtsam.geometry import invert_pose, rotation_angle_deg
 from mvdyn_gtsam.pipeline import reconstruct
 from mvdyn_gtsam.progress import Progress

@@ -19,9 +19,9 @@ from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import Config, to_dict
 from mvdyn_gtsam.evaluation import GroundTruth
 from mvdyn_gtsam.frontend.dense_flow import DisFlow
-from mvdyn_gtsam.frontend.dense_map import testimony_flow
-from mvdyn_gtsam.frontend.start import Start, StartFrame, start_from_arrays, start_to_arrays
-from mvdyn_gtsam.frontend.wide_baseline import ClassicalInitializer
+from mvdyn_gtsam.frontend.start.dense_map import testimony_flow
+from mvdyn_gtsam.frontend.start.model import Start, StartFrame, start_from_arrays, start_to_arrays
+from mvdyn_gtsam.frontend.start.wide_baseline import ClassicalInitializer
 from mvdyn_gtsam.geometry import invert_pose
 from mvdyn_gtsam.progress import NullProgress
 

@@ -14,7 +14,7 @@ from experiments.records import exit_status
 from mvdyn_gtsam.capture import load_capture
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import load_config
-from mvdyn_gtsam.frontend.start import Start
+from mvdyn_gtsam.frontend.start.model import Start
 from mvdyn_gtsam.pipeline import reconstruct
 from mvdyn_gtsam.progress import Progress
 

@@ -14,7 +14,7 @@ from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
 from mvdyn_gtsam.batch.clips import Clip, groundtruth_of, has_groundtruth
 from mvdyn_gtsam.batch.report import Row, State
 from mvdyn_gtsam.errors import MvdynError, ResultError
-from mvdyn_gtsam.frontend.depth_files import depth_files_name
+from mvdyn_gtsam.frontend.depth_priors.depth_files import depth_files_name
 from mvdyn_gtsam.reconstruction import Reconstruction, is_reconstruction
 from mvdyn_gtsam.resuming import resumed
 

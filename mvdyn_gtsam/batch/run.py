@@ -20,7 +20,7 @@ from mvdyn_gtsam.batch.report import BatchReport, Row, State, read_rows
 from mvdyn_gtsam.batch.scheduling import local_cluster, remote_cluster, require_dask, run_clips
 from mvdyn_gtsam.config import Config, given_settings
 from mvdyn_gtsam.errors import DepthPriorError, MvdynError
-from mvdyn_gtsam.frontend.onnx_depth import OnnxDepth, is_model
+from mvdyn_gtsam.frontend.depth_priors.onnx_depth import OnnxDepth, is_model
 from mvdyn_gtsam.progress import NullProgress, Progress
 from mvdyn_gtsam.reconstruction.files import write_atomically, write_json
 from mvdyn_gtsam.refinement.pool import worker_count

@@ -24,7 +24,7 @@ from mvdyn_gtsam.errors import DepthPriorError, ResultError
 if TYPE_CHECKING:
     from mvdyn_gtsam.capture import Capture
     from mvdyn_gtsam.config import Config
-    from mvdyn_gtsam.frontend.depth_prior import DepthPrior
+    from mvdyn_gtsam.frontend.depth_priors.depth_prior import DepthPrior
     from mvdyn_gtsam.reconstruction import Reconstruction
 
 SUMMARY = "recover every camera's pose and depth for every frame"
@@ -123,7 +123,7 @@ def _depth_prior(arguments: argparse.Namespace, capture: Capture) -> DepthPrior 
                 f"--depth-model {arguments.depth_model}: needs the network's file, --depth-prior MODEL.onnx"
             )
         return None
-    from mvdyn_gtsam.frontend.onnx_depth import open_depth_prior
+    from mvdyn_gtsam.frontend.depth_priors.onnx_depth import open_depth_prior
 
     return open_depth_prior(arguments.depth_prior, capture.cameras, arguments.depth_model)
 

@@ -12,7 +12,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import distance_transform_edt, median_filter
 
 from mvdyn_gtsam.config import TrackingConfig
-from mvdyn_gtsam.frontend.aligned_prior import GridDepth
+from mvdyn_gtsam.frontend.depth_priors.aligned_prior import GridDepth
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.geometry import backproject, invert_pose, transform_points
 from mvdyn_gtsam.tracking.kept_flow import KeptFlow

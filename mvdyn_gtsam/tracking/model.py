@@ -12,7 +12,7 @@ import numpy.typing as npt
 from factors.measurement import StructurelessMeasurement
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.config import TrackingConfig
-from mvdyn_gtsam.frontend.aligned_prior import GridDepth
+from mvdyn_gtsam.frontend.depth_priors.aligned_prior import GridDepth
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.geometry import pixel_rays
 from mvdyn_gtsam.graph.connections import EdgeCounts, EdgeKind, Frame

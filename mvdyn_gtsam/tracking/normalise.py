@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvdyn_gtsam.frontend.start import Start, StartFrame
+from mvdyn_gtsam.frontend.start.model import Start, StartFrame
 
 
 def normalised_start(start: Start) -> tuple[Start, tuple[float, ...]]:

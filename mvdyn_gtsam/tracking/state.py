@@ -16,11 +16,11 @@ from factors.priors import pose_prior, scale_prior
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.config import Config
 from mvdyn_gtsam.errors import TrackingError
-from mvdyn_gtsam.frontend.aligned_prior import GridDepth, PriorAtGrid
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
+from mvdyn_gtsam.frontend.depth_priors.aligned_prior import GridDepth, PriorAtGrid
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
 from mvdyn_gtsam.frontend.rig import Pair
-from mvdyn_gtsam.frontend.start import Start
+from mvdyn_gtsam.frontend.start.model import Start
 from mvdyn_gtsam.graph.connections import ConnectionGraph, Edge, EdgeKind, Frame
 from mvdyn_gtsam.tracking.connect import inter_camera_edges
 from mvdyn_gtsam.tracking.depth import carried_log_depth, with_prior

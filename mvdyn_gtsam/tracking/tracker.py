@@ -11,9 +11,9 @@ import numpy.typing as npt
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.config import Config
 from mvdyn_gtsam.errors import TrackingError
-from mvdyn_gtsam.frontend.aligned_prior import GridDepth, PriorAtGrid
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
-from mvdyn_gtsam.frontend.start import Start, StartFrame
+from mvdyn_gtsam.frontend.depth_priors.aligned_prior import GridDepth, PriorAtGrid
+from mvdyn_gtsam.frontend.start.model import Start, StartFrame
 from mvdyn_gtsam.graph.connections import Edge, EdgeKind, Frame
 from mvdyn_gtsam.tracking import finish as end
 from mvdyn_gtsam.tracking.depth import sparse_log_depth

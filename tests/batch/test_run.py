@@ -20,11 +20,11 @@ from mvdyn_gtsam.batch import BatchError, BatchReport, BatchSettings, Clip, Row,
 from mvdyn_gtsam.batch.scheduling import local_cluster, remote_cluster, run_clips
 from mvdyn_gtsam.config import load_config
 from mvdyn_gtsam.errors import DepthPriorError
-from mvdyn_gtsam.frontend.onnx_depth import OnnxDepth
+from mvdyn_gtsam.frontend.depth_priors.onnx_depth import OnnxDepth
 from tests.batch import stand_in
 from tests.batch.stand_in import true_poses, write_captures
 from tests.evaluation.fakes import write_groundtruth
-from tests.frontend.onnx_networks import depth_anything_v2
+from tests.frontend.depth_priors.onnx_networks import depth_anything_v2
 
 SETTINGS = BatchSettings(
     stage="tracking", workers=2, threads=1, command=(sys.executable, "-S", stand_in.__file__)

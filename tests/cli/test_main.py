@@ -23,7 +23,7 @@ from mvdyn_gtsam.cli.progress import progress_line
 from mvdyn_gtsam.config import Config, to_dict
 from mvdyn_gtsam.demo import demo_capture
 from mvdyn_gtsam.errors import ResultError, TrackingError
-from mvdyn_gtsam.frontend.depth_prior import DepthPrior
+from mvdyn_gtsam.frontend.depth_priors.depth_prior import DepthPrior
 from mvdyn_gtsam.progress import Progress
 from mvdyn_gtsam.reconstruction import CaptureInfo, Reconstruction, ReconstructionWriter
 from mvdyn_gtsam.resuming import configure

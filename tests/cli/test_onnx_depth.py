@@ -15,9 +15,9 @@ import pytest
 
 import mvdyn_gtsam.pipeline
 from mvdyn_gtsam.cli.main import main
-from mvdyn_gtsam.frontend.depth_models import USABLE
+from mvdyn_gtsam.frontend.depth_priors.depth_models import USABLE
 from mvdyn_gtsam.reconstruction import Reconstruction
-from tests.frontend.onnx_networks import MEAN, STD, depth_anything_v2
+from tests.frontend.depth_priors.onnx_networks import MEAN, STD, depth_anything_v2
 from tests.tracking.synthetic_scene import Scene, two_cameras
 
 METRES = 8.0

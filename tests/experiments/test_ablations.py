@@ -21,7 +21,7 @@ from mvdyn_gtsam.baselines.process import ProcessUsage
 from mvdyn_gtsam.config import Config, load_config
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.evaluation import GroundTruth
-from mvdyn_gtsam.frontend.start import Start
+from mvdyn_gtsam.frontend.start.model import Start
 from mvdyn_gtsam.geometry import invert_pose, rotation_angle_deg
 from tests.tracking.synthetic_scene import Scene, two_cameras
 

@@ -10,7 +10,7 @@ from onnx.external_data_helper import set_external_data
 
 from mvdyn_gtsam.errors import BaselineError, DepthPriorError
 from mvdyn_gtsam.frontend.onnx_model import OnnxModel, fingerprint
-from tests.frontend.onnx_networks import depth_anything_v2
+from tests.frontend.depth_priors.onnx_networks import depth_anything_v2
 
 
 def test_it_depends_on_the_content_alone(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvdyn_gtsam.capture.model import Camera, Capture
-from mvdyn_gtsam.frontend.start import Start, StartFrame
+from mvdyn_gtsam.frontend.start.model import Start, StartFrame
 
 WIDTH, HEIGHT = 160, 120
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mvdyn_gtsam.config import TrackingConfig, load_config
-from mvdyn_gtsam.frontend.aligned_prior import GridDepth, PriorAtGrid
 from mvdyn_gtsam.frontend.dense_flow import DisFlow
+from mvdyn_gtsam.frontend.depth_priors.aligned_prior import GridDepth, PriorAtGrid
 from mvdyn_gtsam.frontend.grid import Grid
 from mvdyn_gtsam.tracking.depth import prior_information, with_prior
 from mvdyn_gtsam.tracking.tracker import Tracker

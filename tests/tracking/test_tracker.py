@@ -10,7 +10,7 @@ import pytest
 from mvdyn_gtsam.config import Config, load_config
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.dense_flow import DisFlow
-from mvdyn_gtsam.frontend.start import Start, StartFrame
+from mvdyn_gtsam.frontend.start.model import Start, StartFrame
 from mvdyn_gtsam.geometry import invert_pose, rotation_angle_deg
 from mvdyn_gtsam.graph.connections import EdgeKind
 from mvdyn_gtsam.tracking.model import StepReport, TrackingResult
