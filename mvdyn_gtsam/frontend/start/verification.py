@@ -88,7 +88,7 @@ def verify_placement(
 ) -> Verdict:
     """Warp every view of either camera into every view of the other.
 
-    ``careful``: what looks different must do so at every depth within the tolerance; takes up to ten times as
+    ``careful``: what looks different must do so at every depth within the tolerance; takes several times as
     long.
     """
     agreement = contradiction = comparable = 0.0
@@ -123,7 +123,8 @@ def _testimony(
     careful: bool,
 ) -> _Testimony:
     known = np.isfinite(source.depth)
-    z, x, y = _seen_at(source, target, targetSsource, known, 1.0)
+    warp = _warp(source, target, targetSsource, known)
+    z, x, y = _seen_at(warp, target.intrinsics, 1.0)
     inside = known & _within(x, y, target)
     if not inside.any():
         return _Testimony()
@@ -141,7 +142,7 @@ def _testimony(
     for error in _errors_of_depth(config) if careful else ():
         if not different.any():
             break
-        _, x, y = _seen_at(source, target, targetSsource, known, float(np.exp(error)))
+        _, x, y = _seen_at(warp, target.intrinsics, float(np.exp(error)))
         again, _ = _look(source, target, x, y, known & _within(x, y, target), config)
         different &= ~(again >= least)
     total = len(source.depth)
@@ -159,20 +160,29 @@ def _errors_of_depth(config: VerificationConfig) -> list[float]:
     return sorted((float(step) for step in np.delete(steps, config.looks // 2)), key=abs)
 
 
-def _seen_at(
-    source: DepthView,
-    target: DepthView,
-    targetSsource: Similarity,
-    known: npt.NDArray[np.bool_],
-    factor: float,
-) -> tuple[Array, Array, Array]:
-    """Depth and pixel ``(N,)`` in the target of the source's points, their depth times ``factor``."""
+def _warp(
+    source: DepthView, target: DepthView, targetSsource: Similarity, known: npt.NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """The source's points ``(N, 3)`` in the axes of the target, but from the source's centre, which is at
+    ``(3,)``: their depth may then be scaled by what one likes."""
+    cSm = Similarity(1.0, *_parts(invert_pose(target.mTc))).compose(targetSsource)
+    cSs = cSm.compose(Similarity(1.0, *_parts(source.mTc)))
     rays = pixel_rays(source.grid.pixels, source.intrinsics)
-    points = transform_points(source.mTc, rays * (factor * np.where(known, source.depth, 1.0))[:, None])
-    seen = transform_points(invert_pose(target.mTc), targetSsource.transform_points(points))
-    z = np.where(seen[:, 2] > 1e-6, seen[:, 2], np.nan)
-    x = target.intrinsics[0, 0] * seen[:, 0] / z + target.intrinsics[0, 2]
-    y = target.intrinsics[1, 1] * seen[:, 1] / z + target.intrinsics[1, 2]
+    turned = rays @ (cSs.scale * cSs.rotation).T
+    return turned * np.where(known, source.depth, 1.0)[:, None], cSs.translation
+
+
+def _parts(pose: Array) -> tuple[Array, Array]:
+    return pose[:3, :3], pose[:3, 3]
+
+
+def _seen_at(warp: tuple[Array, Array], intrinsics: Array, factor: float) -> tuple[Array, Array, Array]:
+    """Depth and pixel ``(N,)`` in the target of the source's points, their depth times ``factor``."""
+    points, centre = warp
+    z = factor * points[:, 2] + centre[2]
+    z = np.where(z > 1e-6, z, np.nan)
+    x = intrinsics[0, 0] * (factor * points[:, 0] + centre[0]) / z + intrinsics[0, 2]
+    y = intrinsics[1, 1] * (factor * points[:, 1] + centre[1]) / z + intrinsics[1, 2]
     return z, x, y
 
 
