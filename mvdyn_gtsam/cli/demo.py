@@ -66,7 +66,6 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
     console.print(format_table(scores))
     for line in summary(result, seconds):
         console.print(line)
-    console.print(f"look around in 3D: mvdyn view {arguments.out}")
     console.print("look at:")
     for path in (*plots, sheet, pictures / "scores.json"):
         console.print(f"  {path}")

@@ -459,7 +459,7 @@ def test_demo(
         pass  # an earlier demo, which is replaced
     code, said, _ = run(capsys, "demo", "--out", out)
     assert code == 0
-    assert f"mvdyn view {out}\n" in said
+    assert f"mvdyn view {out}, to look at it in 3D\n" in said
     pictures = [line.strip() for line in said.split("look at:")[1].splitlines() if line.strip()]
     assert all(Path(path).is_file() for path in pictures)
     assert {"trajectories.png", "depth.png", "scores.json"} <= {Path(path).name for path in pictures}
