@@ -18,7 +18,6 @@ from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.start.dense_map import DenseMap, DenseMapConfig, move_map
 from mvdyn_gtsam.frontend.start.joint_adjustment import AdjustmentConfig, adjust_maps
-from mvdyn_gtsam.frontend.start.verification import Verdict, VerificationConfig, verify_placement
 from mvdyn_gtsam.geometry import Similarity
 
 Array = npt.NDArray[np.float64]
@@ -49,27 +48,6 @@ class TrialConfig:
             )
 
 
-def try_placement(
-    cameras: tuple[Camera, Camera],
-    maps: tuple[DenseMap, DenseMap],
-    aSb: Similarity,
-    same_point: Index,
-    adjustment: AdjustmentConfig,
-    trial: TrialConfig,
-    dense_map: DenseMapConfig,
-    verification: VerificationConfig,
-) -> tuple[Similarity, Verdict]:
-    """The placement ``aSb`` as a short joint adjustment mends it, and what dense warping says of it then.
-
-    ``same_point``: ``(M, 2)`` rows of the maps' points that are one.
-    """
-    aSb, moved = mend_placement(cameras, maps, aSb, same_point, adjustment, trial, dense_map)
-    verdict = verify_placement(
-        moved[0].views, moved[1].views, Similarity.identity(), verification, careful=True
-    )
-    return aSb, verdict
-
-
 def mend_placement(
     cameras: tuple[Camera, Camera],
     maps: tuple[DenseMap, DenseMap],
@@ -79,7 +57,10 @@ def mend_placement(
     trial: TrialConfig,
     dense_map: DenseMapConfig,
 ) -> tuple[Similarity, tuple[DenseMap, DenseMap]]:
-    """The placement ``aSb`` as a short joint adjustment mends it, and both maps in one world after that."""
+    """The placement ``aSb`` as a short joint adjustment mends it, and both maps in one world after that.
+
+    ``same_point``: ``(M, 2)`` rows of the maps' points that are one.
+    """
     short = replace(adjustment, points_per_camera=trial.points_per_camera, search_px=trial.search_px)
     sparse = [dense.sparse for dense in maps]
     frames = adjust_maps(cameras, sparse, {0: Similarity.identity(), 1: aSb}, [(0, 1, same_point)], short)

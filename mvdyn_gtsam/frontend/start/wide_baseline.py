@@ -38,7 +38,7 @@ from mvdyn_gtsam.frontend.start.settings import WideBaselineConfig
 from mvdyn_gtsam.frontend.start.single_camera import CameraMap, choose_frames
 from mvdyn_gtsam.frontend.start.still_cameras import SamePoint, place_still_cameras
 from mvdyn_gtsam.frontend.start.still_view import StillView, build_still_view, frames_of_view, lone_frames
-from mvdyn_gtsam.frontend.start.trial import try_placement
+from mvdyn_gtsam.frontend.start.trial import mend_placement
 from mvdyn_gtsam.frontend.start.verification import Verdict, verify_placement
 from mvdyn_gtsam.frontend.threads import flow_threads
 from mvdyn_gtsam.geometry import Similarity
@@ -312,7 +312,7 @@ class ClassicalInitializer:
         same_point = agreeing_pairs(
             matches, placement.aSb, cameras[0].intrinsics, cameras[1].intrinsics, config.placement
         )
-        aSb, verdict = try_placement(
+        aSb, moved = mend_placement(
             cameras,
             (first, second),
             placement.aSb,
@@ -320,7 +320,9 @@ class ClassicalInitializer:
             config.adjustment,
             config.trial,
             config.dense_map,
-            config.verification,
+        )
+        verdict = verify_placement(
+            moved[0].views, moved[1].views, Similarity.identity(), config.verification, careful=True
         )
         logger.debug("%d - %d: %s became %s", a, b, placement.verdict, verdict)
         return Placement(a, b, aSb, verdict)

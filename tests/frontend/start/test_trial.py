@@ -16,7 +16,7 @@ from mvdyn_gtsam.frontend.start.dense_map import DenseMap, DenseMapConfig, densi
 from mvdyn_gtsam.frontend.start.features import Features
 from mvdyn_gtsam.frontend.start.joint_adjustment import AdjustmentConfig
 from mvdyn_gtsam.frontend.start.single_camera import CameraMap
-from mvdyn_gtsam.frontend.start.trial import TrialConfig, similarity_of, try_placement
+from mvdyn_gtsam.frontend.start.trial import TrialConfig, mend_placement, similarity_of
 from mvdyn_gtsam.frontend.start.verification import VerificationConfig, verify_placement
 from mvdyn_gtsam.geometry import (
     Similarity,
@@ -85,9 +85,10 @@ def tried(scene: Scene, maps: tuple[DenseMap, DenseMap], aSb: Similarity) -> tup
     rows = np.arange(0, 800, 8)
     same = np.column_stack([rows, rows])
     cameras = scene.cameras[0], scene.cameras[1]
-    mended, verdict = try_placement(
-        cameras, maps, aSb, same, AdjustmentConfig(), TrialConfig(), DENSE, VERIFY
+    mended, (first, second) = mend_placement(
+        cameras, maps, aSb, same, AdjustmentConfig(), TrialConfig(), DENSE
     )
+    verdict = verify_placement(first.views, second.views, Similarity.identity(), VERIFY, careful=True)
     return mended, verdict.trust
 
 
