@@ -41,7 +41,8 @@ class LiftConfig:
     """Share of favourable testimony a placement needs, unless no other is near it in matches. Source:
     experiments/placement_trust.py; see ``ClassicalInitializer``."""
     minimum_inliers: int = 20
-    """Matches that must support it. Source: as above; a true one with 12 ended up 2.5 degrees off."""
+    """Matches that must support it. Source: experiments/start_variants.py; a true one with 12 ended up
+    2.5 degrees off."""
     minimum_share: float = 0.4
     """Share of the comparable surface that has to agree. Source: experiments/start_variants.py; one that had
     0.35, of a map that was bent, stayed 2.3 degrees off."""

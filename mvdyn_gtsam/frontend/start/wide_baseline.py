@@ -271,7 +271,7 @@ class ClassicalInitializer:
         rivals = [*zip(enough, mended, strict=True), *untried]
         found: list[Placement] = []
         for candidate, tried in zip(enough, mended, strict=True):
-            alone = candidate.alone or _stands_alone(candidate, tried, rivals)
+            alone = _stands_alone(candidate, tried, rivals)
             trust = config.minimum_trust if alone else config.lift.minimum_trust
             if self._believed(tried.verdict, trust) and tried.verdict.share >= config.lift.minimum_share:
                 found.append(tried)

@@ -20,7 +20,7 @@ from mvdyn_gtsam.frontend.start.model import Start
 from mvdyn_gtsam.frontend.start.placement import PlacementConfig
 from mvdyn_gtsam.frontend.start.settings import WideBaselineConfig
 from mvdyn_gtsam.frontend.start.verification import Verdict
-from mvdyn_gtsam.frontend.start.wide_baseline import Candidate, ClassicalInitializer
+from mvdyn_gtsam.frontend.start.wide_baseline import NEAR, Candidate, ClassicalInitializer
 from mvdyn_gtsam.geometry import Similarity, rotation_angle_deg
 from tests.frontend.start.synthetic_maps import similarity
 from tests.tracking.synthetic_scene import Scene, two_cameras
@@ -95,7 +95,7 @@ class Judged(ClassicalInitializer):
             Candidate(
                 Placement(0, 1, similarity(1.0, (0.0, 0.0, 0.0), (apart * number, 0.0, 0.0)), verdict),
                 self.inliers,
-                20.0,
+                NEAR * 20.0 if alone else 20.0,
                 alone,
             )
             for number, (verdict, alone) in enumerate(candidates)
