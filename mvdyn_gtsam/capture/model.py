@@ -25,6 +25,8 @@ class Camera:
     """OpenCV order k1, k2, p1, p2, k3; frames are handed out undistorted with the same intrinsics."""
     time_offset: float = 0.0
     """Seconds to add to this camera's own clock to get the common clock."""
+    focal_known: bool = True
+    """Where False, fx and fy are a first guess, and the start finds the focal length in the video."""
 
     @property
     def intrinsics(self) -> npt.NDArray[np.float64]:
