@@ -71,7 +71,7 @@ def measure(variant: CaptureVariant, overrides: Sequence[str], scenes: Path) -> 
     flow = DisFlow(testimony_flow(frontend.flow))
     maps = {}
     for camera in range(len(altered.capture.cameras)):
-        _, dense = map_camera(altered.capture, camera, flow=flow, config=config)
+        dense = map_camera(altered.capture, camera, flow=flow, config=config).dense
         if dense is not None and dense.known >= config.minimum_known:
             maps[camera] = dense
     lifted = {

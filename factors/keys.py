@@ -1,9 +1,11 @@
-"""Variable keys of the graph: pose ``X`` and log depth scale ``S`` of a (camera, time) frame, mount ``M``.
+"""Variable keys of the graph: pose ``X`` and log depth scale ``S`` of a (camera, time) frame, mount ``M``,
+focal length ``F`` of a camera.
 
 A key packs ``character (8 bits) | camera (16 bits) | time (40 bits)`` into one integer, so sorting keys sorts
 by kind, camera and time. ``gtsam.DefaultKeyFormatter`` prints the character and one number; use ``key_name``.
 ``X`` holds a ``gtsam.Pose3`` (wTc), ``S`` a plain double (``values.insert(S(c, t), 0.0)``, ``atDouble``),
-``M`` the ``gtsam.Pose3`` aTb of two cameras a and b mounted on one another, b in place of the time.
+``M`` the ``gtsam.Pose3`` aTb of two cameras a and b mounted on one another, b in place of the time,
+``F`` a ``gtsam.Cal3f``.
 """
 
 from __future__ import annotations
@@ -35,6 +37,11 @@ def S(camera: int, time: int) -> int:  # noqa: N802 - the field's name for a sca
 def M(camera_a: int, camera_b: int) -> int:  # noqa: N802 - in line with the others
     """Key of the relative pose ``aTb`` of two cameras mounted on one another."""
     return _pack("m", camera_a, camera_b)
+
+
+def F(camera: int) -> int:  # noqa: N802 - in line with the others
+    """Key of the focal length of a camera, the same at all times."""
+    return _pack("f", camera, 0)
 
 
 def camera_and_time(key: int) -> tuple[int, int]:

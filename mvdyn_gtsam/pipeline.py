@@ -22,7 +22,7 @@ from mvdyn_gtsam.frontend.depth_priors.aligned_prior import AlignedPrior, align_
 from mvdyn_gtsam.frontend.depth_priors.depth_prior import DepthPrior, NoDepthPrior
 from mvdyn_gtsam.frontend.depth_priors.predictions import Predictions
 from mvdyn_gtsam.frontend.start.dense_map import testimony_flow
-from mvdyn_gtsam.frontend.start.model import Start, start_from_arrays, start_to_arrays
+from mvdyn_gtsam.frontend.start.model import Start, found_cameras, start_from_arrays, start_to_arrays
 from mvdyn_gtsam.frontend.start.wide_baseline import ClassicalInitializer, WideBaselineInitializer
 from mvdyn_gtsam.frontend.threads import in_order
 from mvdyn_gtsam.progress import NullProgress, Progress
@@ -87,11 +87,14 @@ def reconstruct(
     with writer:
         if not writer.stage_finished("tracking"):
             start = _start(capture, initializer, writer, progress)
+            capture = replace(capture, cameras=found_cameras(capture.cameras, start))
+            _note_focal_lengths(capture, start, writer)
             writer.set_groups([[capture.cameras[camera].name for camera in group] for group in start.groups])
             _note_groups(capture, start, writer)
             with _aligned(depth_prior, capture, start, writer, progress) as prior:
                 _track(capture, start, tracking_flow, prior, config, writer, progress)
         if stage == "refinement" and not writer.stage_finished("refinement"):
+            capture = replace(capture, cameras=writer.cameras)
             _warn_of_new_start(run, writer)
             refinement_flow = flow if flow is not None else DisFlow(dense_flow_config(config))
             _refine(capture, refinement_flow, config, writer, progress)
@@ -111,6 +114,16 @@ def _start(
     writer.write_arrays("start", start_to_arrays(start))
     writer.finish_stage("start", perf_counter() - began)
     return start
+
+
+def _note_focal_lengths(capture: Capture, start: Start, writer: ReconstructionWriter) -> None:
+    named = {capture.cameras[index].name: focal for index, focal in start.focal.items()}
+    writer.set_focal_lengths({name: (focal.pixels, focal.deviation) for name, focal in named.items()})
+    for name, focal in named.items():
+        writer.add_note(
+            f"{name}: focal length found in its video, {focal.pixels:.1f} px,"
+            f" give or take {focal.deviation:.1f}"
+        )
 
 
 def _note_groups(capture: Capture, start: Start, writer: ReconstructionWriter) -> None:

@@ -30,7 +30,8 @@ CONVENTIONS = {
     "camera_axes": "OpenCV: x right, y down, z forward",
     "pixels": "integer coordinates are pixel centres;"
     " a centred principal point is ((width - 1) / 2, (height - 1) / 2)",
-    "intrinsics": "pinhole at the input resolution, of the undistorted frames",
+    "intrinsics": "pinhole at the input resolution, of the undistorted frames; of a camera whose focal_known"
+    " is false those of capture are first guesses, and focal_lengths has what was found, in px",
     "depth": f"z-depth (not ray length) at the input resolution; {DEPTH_ENCODING}; NaN once read",
     "confidence": f"0 (do not use) to 1; {CONFIDENCE_ENCODING}",
     "groups": "cameras of one group share one world frame and one scale; different groups do not",
@@ -73,6 +74,10 @@ class CaptureInfo:
         """The ``capture`` entry of the manifest, as plain JSON values."""
         entry: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         del entry["source"]
+        for camera in entry["cameras"]:
+            # so that runs of versions that knew no other go on
+            if camera["focal_known"]:
+                del camera["focal_known"]
         return entry
 
 
@@ -145,11 +150,22 @@ def is_reconstruction(folder: Path) -> bool:
 
 
 def cameras_of(manifest: Mapping[str, Any]) -> tuple[Camera, ...]:
-    """The cameras of a manifest."""
+    """The cameras of a manifest, with the focal lengths that were found."""
     return tuple(
-        Camera(**{**entry, "distortion": tuple(entry.get("distortion", ()))})
+        Camera(
+            **{
+                **entry,
+                "distortion": tuple(entry.get("distortion", ())),
+                **_found_focal(manifest, entry["name"]),
+            }
+        )
         for entry in manifest["capture"]["cameras"]
     )
+
+
+def _found_focal(manifest: Mapping[str, Any], camera: str) -> dict[str, float]:
+    found = manifest.get("focal_lengths", {}).get(camera)
+    return {} if found is None else {"fx": float(found["pixels"]), "fy": float(found["pixels"])}
 
 
 def _layout_problem(manifest: Mapping[str, Any]) -> str | None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import ResultError
 from mvdyn_gtsam.reconstruction.encoding import encode_confidence, encode_depth, encode_mask
 from mvdyn_gtsam.reconstruction.files import format_tum, write_atomically, write_json
@@ -30,6 +31,7 @@ from mvdyn_gtsam.reconstruction.manifest import (
     MANIFEST_NAME,
     CaptureInfo,
     Status,
+    cameras_of,
     is_reconstruction,
     new_manifest,
     read_manifest,
@@ -245,6 +247,21 @@ class ReconstructionWriter:
         self._manifest["groups"] = [list(group) for group in groups]
         self._write_manifest()
 
+    def set_focal_lengths(self, found: Mapping[str, tuple[float, float]]) -> None:
+        """Set the focal lengths that were found, by camera, and their standard deviations, px."""
+        for camera in found:
+            self._check_camera(camera)
+        self._manifest["focal_lengths"] = {
+            camera: {"pixels": pixels, "deviation": deviation}
+            for camera, (pixels, deviation) in found.items()
+        }
+        self._write_manifest()
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Those of the capture, with the focal lengths that were found."""
+        return cameras_of(self._manifest)
+
     def set_unit(self, unit: str) -> None:
         """Set the unit of translations and depth: "arbitrary" or "metric"."""
         if unit not in ("arbitrary", "metric"):
@@ -310,6 +327,12 @@ def refuse_unusable(folder: Path, *, resume: bool, overwrite: bool) -> None:
 
 
 def _refuse_other_capture(folder: Path, manifest: Mapping[str, Any], fresh: Mapping[str, Any]) -> None:
+    known = [[c.get("focal_known", True) for c in one["capture"]["cameras"]] for one in (manifest, fresh)]
+    if len(known[0]) == len(known[1]) and known[0] != known[1]:
+        raise ResultError(
+            f"{folder}: was begun with other cameras whose focal length is to be found; give or leave out"
+            " --estimate-focal as then, or choose another --out"
+        )
     for key, value in fresh["capture"].items():
         if manifest["capture"].get(key) != value:
             raise ResultError(

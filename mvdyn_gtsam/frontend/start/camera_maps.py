@@ -3,62 +3,82 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass, replace
 
-from mvdyn_gtsam.capture.model import Capture
+from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.start.dense_map import DenseMap, densify_map
 from mvdyn_gtsam.frontend.start.features import extract_features
-from mvdyn_gtsam.frontend.start.followed_keypoints import Matches, follow_keypoints
+from mvdyn_gtsam.frontend.start.focal import no_focal, with_found_focal
+from mvdyn_gtsam.frontend.start.followed_keypoints import Matches, follow_keypoints, joined_matches
 from mvdyn_gtsam.frontend.start.settings import WideBaselineConfig
-from mvdyn_gtsam.frontend.start.single_camera import CameraMap, build_camera_map, choose_frames
+from mvdyn_gtsam.frontend.start.single_camera import (
+    CameraMap,
+    build_camera_map,
+    choose_frames,
+    match_neighbours,
+    usable_pairs,
+)
 
 logger = logging.getLogger(__name__)
 
 
-def map_camera(
-    capture: Capture, camera: int, flow: DenseFlow, config: WideBaselineConfig
-) -> tuple[CameraMap, DenseMap | None]:
+@dataclass(frozen=True)
+class MappedCamera:
+    """What a camera's own video tells."""
+
+    camera: Camera
+    """With the focal length found, where it was not known."""
+    sparse: CameraMap
+    dense: DenseMap | None
+    """None without parallax."""
+
+
+def map_camera(capture: Capture, index: int, flow: DenseFlow, config: WideBaselineConfig) -> MappedCamera:
     """Structure from motion of one camera, and its dense depth where it shows any parallax.
 
     Where what moves outweighs what stands still, or a texture repeats, descriptors can tie a map to the wrong
     thing. A rigid scene then explains little of the flow; keypoints followed along that flow are added, and
-    of the two maps the one that explains more is kept.
+    of the two maps the one that explains more is kept. Raises TrackingError where the focal length is neither
+    known nor told by the video.
     """
+    camera = capture.cameras[index]
     times, motion = choose_frames(
-        capture, camera, config.frame_step, config.maximum_frames, config.minimum_frames
+        capture, index, config.frame_step, config.maximum_frames, config.minimum_frames
     )
     features = [
-        extract_features(capture.read(camera, int(t)), config.features, config.contrast) for t in times
+        extract_features(capture.read(index, int(t)), config.features, config.contrast) for t in times
     ]
+    matched = match_neighbours(features, config.neighbours, config.ratio)
+    if not camera.focal_known:
+        camera = with_found_focal(camera, features, usable_pairs(matched))
+        cameras = (*capture.cameras[:index], camera, *capture.cameras[index + 1 :])
+        capture = replace(capture, cameras=cameras)
     # Where the frames are closer, as many neighbours reach as far.
     spacing = max(motion / max(len(times) - 1, 1), 1e-6)
     reach = round(config.dense_map.neighbours * config.frame_step / spacing)
 
-    def solved(followed: Matches | None) -> tuple[CameraMap, DenseMap | None]:
+    def solved(pairs: Matches) -> MappedCamera:
         own = build_camera_map(
-            camera,
-            capture.cameras[camera],
-            times,
-            features,
-            neighbours=config.neighbours,
-            ratio=config.ratio,
-            minimum_angle_deg=config.minimum_parallax_deg,
-            followed=followed,
+            index, camera, times, features, pairs, minimum_angle_deg=config.minimum_parallax_deg
         )
-        return own, densify_map(capture, own, flow, config.dense_map, reach) if own.has_depth else None
+        dense = densify_map(capture, own, flow, config.dense_map, reach) if own.has_depth else None
+        return MappedCamera(camera, own, dense)
 
-    own, dense = solved(None)
-    if dense is None or dense.rigidity >= config.minimum_rigidity:
-        return own, dense
+    first = solved(matched)
+    if first.dense is None and not camera.focal_known:
+        raise no_focal(camera, "it shows no parallax: the camera stands still, or only turns")
+    if first.dense is None or first.dense.rigidity >= config.minimum_rigidity:
+        return first
     followed = follow_keypoints(
-        lambda row: capture.read(camera, int(times[row])), features, config.neighbours, flow
+        lambda row: capture.read(index, int(times[row])), features, config.neighbours, flow
     )
-    again, dense_again = solved(followed)
-    rigidity = 0.0 if dense_again is None else dense_again.rigidity
+    second = solved(joined_matches(matched, followed))
+    rigidity = 0.0 if second.dense is None else second.dense.rigidity
     logger.info(
         "%s: its map explains %.0f %% of the flow, %.0f %% with keypoints followed along it",
-        capture.cameras[camera].name,
-        100.0 * dense.rigidity,
+        camera.name,
+        100.0 * first.dense.rigidity,
         100.0 * rigidity,
     )
-    return (again, dense_again) if rigidity > dense.rigidity else (own, dense)
+    return second if rigidity > first.dense.rigidity else first

@@ -15,10 +15,19 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from factors.keys import X
-from factors.priors import pose_prior
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import ConfigError
-from mvdyn_gtsam.frontend.rig import Pair, RigConfig, add_mounts, likely_mounts, solved_mounts
+from mvdyn_gtsam.frontend.rig import Pair, RigConfig, likely_mounts, solved_mounts
+from mvdyn_gtsam.frontend.start.bundle import (
+    Bundle,
+    Label,
+    Observations,
+    bundle_of,
+    focal_deviations,
+    free_cameras,
+    solve_bundle,
+    solved_cameras,
+)
 from mvdyn_gtsam.frontend.start.features import Features
 from mvdyn_gtsam.frontend.start.model import StartFrame
 from mvdyn_gtsam.frontend.start.single_camera import CameraMap
@@ -27,13 +36,8 @@ from mvdyn_gtsam.geometry import Similarity, invert_pose, project, transform_poi
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
-Label = tuple[int, int]
-"""Camera and row of one of its map's frames."""
-
 logger = logging.getLogger(__name__)
 
-ROBUST_PX = 1.0
-"""Cauchy scale of reprojection errors; SIFT is good to about half a pixel."""
 MISFIT_PX = 4.0
 """Reprojection error beyond which a sighting is dropped; COLMAP's filter_max_reproj_error."""
 
@@ -62,19 +66,27 @@ class AdjustmentConfig:
 
 
 @dataclass(frozen=True)
-class Observations:
-    """Every sighting of every landmark; rows belong together."""
+class Adjusted:
+    """The maps of some cameras in one world."""
 
-    landmark: Index
-    """``(M,)`` row in ``points``."""
-    camera: Index
-    """``(M,)``"""
-    frame: Index
-    """``(M,)`` row in that camera's map."""
-    pixel: Array
-    """``(M, 2)`` px"""
-    points: Array
-    """``(P, 3)`` in the world."""
+    frames: dict[int, tuple[StartFrame, ...]]
+    """By camera, sparse depths included."""
+    cameras: tuple[Camera, ...]
+    """With the focal lengths that were yet to be found."""
+    focal_deviation: dict[int, float]
+    """Of these, px; by camera."""
+
+
+@dataclass(frozen=True)
+class _State:
+    """Between two rounds."""
+
+    cameras: tuple[Camera, ...]
+    wTc: dict[Label, Array]
+    observations: Observations
+    mounts: Mapping[Pair, Array]
+    bundle: Bundle
+    solution: gtsam.Values
 
 
 def adjust_maps(
@@ -83,8 +95,8 @@ def adjust_maps(
     wSm: Mapping[int, Similarity],
     same_point: Sequence[tuple[int, int, Index]],
     config: AdjustmentConfig,
-) -> dict[int, tuple[StartFrame, ...]]:
-    """Frames of every placed camera in the common world, sparse depths included.
+) -> Adjusted:
+    """Every placed camera in the common world, and the focal lengths that are not known.
 
     ``same_point`` holds ``(camera a, camera b, (M, 2) rows of map points that are one)``. After a first
     solution every point is looked for in every other frame, near where it should be: that closes loops
@@ -97,19 +109,21 @@ def adjust_maps(
         for frame, pose in enumerate(similarity.transform_poses(maps[camera].mTc))
     }
     times = {(camera, frame): int(maps[camera].times[frame]) for camera, frame in wTc}
-    wTc, observations, mounts = _optimise(cameras, times, wTc, observations, {}, config)
+    state = _optimise(tuple(cameras), times, wTc, observations, {}, config)
     for radius in config.search_px:
-        found = _search(cameras, maps, wTc, observations, radius, config.similarity)
-        wTc, observations, mounts = _optimise(cameras, times, wTc, found, mounts, config)
-    for a, b in mounts:
+        found = _search(state.cameras, maps, state.wTc, state.observations, radius, config.similarity)
+        state = _optimise(state.cameras, times, state.wTc, found, state.mounts, config)
+    for a, b in state.mounts:
         logger.info("%s and %s are mounted on one another", cameras[a].name, cameras[b].name)
-    return {
+    frames = {
         camera: tuple(
-            _start_frame(camera, frame, maps[camera], wTc[camera, frame], observations)
+            _start_frame(camera, frame, maps[camera], state.wTc[camera, frame], state.observations)
             for frame in range(len(maps[camera].times))
         )
         for camera in wSm
     }
+    free = free_cameras(cameras, wTc)
+    return Adjusted(frames, state.cameras, focal_deviations(state.bundle, state.solution, free))
 
 
 def _search(
@@ -274,81 +288,36 @@ def _choose_points(landmark: Index, camera: Index, count: int, per_camera: int) 
 
 
 def _optimise(
-    cameras: Sequence[Camera],
+    cameras: tuple[Camera, ...],
     times: Mapping[Label, int],
     wTc: Mapping[Label, Array],
     observations: Observations,
     mounts: Mapping[Pair, Array],
     config: AdjustmentConfig,
-) -> tuple[dict[Label, Array], Observations, dict[Pair, Array]]:
+) -> _State:
     """Bundle adjustment with a redescending loss; sightings that do not fit afterwards are dropped.
 
     ``mounts`` are held. Where there are none yet, cameras that move like a rig are tried as one, and their
     mounts returned if the images bear it out.
     """
-    sightings, values, landmark_key = _sightings(cameras, wTc, observations)
-    graph = gtsam.NonlinearFactorGraph(sightings)
-    _fix_gauge(graph, wTc, observations, landmark_key)
-    solution = _solve(graph, values, times, mounts, config)
+    bundle = bundle_of(cameras, wTc, observations)
+    effort = config.maximum_iterations, config.relative_tolerance
+    solution = solve_bundle(bundle.graph, bundle.values, times, mounts, *effort)
     mounts = solved_mounts(solution, mounts)
     if not mounts:
         poses = {(label[0], times[label]): solution.atPose3(X(*label)).matrix() for label in wTc}
         likely = likely_mounts(poses, config.rig)
         if likely:
-            held = _solve(graph, solution, times, likely, config)
-            increase = sightings.error(held) / max(sightings.error(solution), 1e-12) - 1.0
+            held = solve_bundle(bundle.graph, solution, times, likely, *effort)
+            increase = bundle.sightings.error(held) / max(bundle.sightings.error(solution), 1e-12) - 1.0
             logger.debug("holding %s as mounted: cost %+.1f %%", list(likely), 100.0 * increase)
             if increase <= config.rig.cost_increase:
                 solution, mounts = held, solved_mounts(held, likely)
     solved = {label: solution.atPose3(X(*label)).matrix() for label in wTc}
-    points = np.array([solution.atPoint3(key) for key in landmark_key]).reshape(-1, 3)
-    return solved, _fitting(cameras, solved, replace(observations, points=points)), mounts
-
-
-def _sightings(
-    cameras: Sequence[Camera], wTc: Mapping[Label, Array], observations: Observations
-) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[int]]:
-    """Reprojection factors, the values to begin with, and the keys of the landmarks."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for (camera, frame), pose in wTc.items():
-        values.insert(X(camera, frame), gtsam.Pose3(pose))
-    landmark_key = [gtsam.symbol("l", index) for index in range(len(observations.points))]
-    for key, point in zip(landmark_key, observations.points, strict=True):
-        values.insert(key, point)
-    noise = gtsam.noiseModel.Robust.Create(
-        gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST_PX), gtsam.noiseModel.Isotropic.Sigma(2, 1.0)
-    )
-    calibrations = [gtsam.Cal3_S2(c.fx, c.fy, 0.0, c.cx, c.cy) for c in cameras]
-    for landmark, camera, frame, pixel in zip(
-        observations.landmark.tolist(),
-        observations.camera.tolist(),
-        observations.frame.tolist(),
-        observations.pixel,
-        strict=True,
-    ):
-        graph.add(
-            gtsam.GenericProjectionFactorCal3_S2(
-                pixel, noise, X(camera, frame), landmark_key[landmark], calibrations[camera], False, False
-            )
-        )
-    return graph, values, landmark_key
-
-
-def _solve(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    times: Mapping[Label, int],
-    mounts: Mapping[Pair, Array],
-    config: AdjustmentConfig,
-) -> gtsam.Values:
-    """Levenberg-Marquardt with ``mounts`` held; ``graph`` and ``values`` stay as they are."""
-    if mounts:
-        graph, values = gtsam.NonlinearFactorGraph(graph), gtsam.Values(values)
-        add_mounts(graph, values, mounts, [((label[0], time), X(*label)) for label, time in times.items()])
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(config.maximum_iterations)
-    parameters.setRelativeErrorTol(config.relative_tolerance)
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    points = np.array([solution.atPoint3(key) for key in bundle.landmarks]).reshape(-1, 3)
+    cameras = solved_cameras(cameras, wTc, solution)
+    fitting = _fitting(cameras, solved, replace(observations, points=points))
+    return _State(cameras, solved, fitting, mounts, bundle, solution)
 
 
 def _fitting(
@@ -374,28 +343,6 @@ def _fitting(
         observations.pixel[fits],
         observations.points[used],
     )
-
-
-def _fix_gauge(
-    graph: gtsam.NonlinearFactorGraph,
-    wTc: Mapping[Label, Array],
-    observations: Observations,
-    landmark_key: list[int],
-) -> None:
-    """Hold one pose, and the scale by its distance to the farthest; a breath of a prior on every point."""
-    anchor = min(wTc)
-    graph.add(pose_prior(X(*anchor), wTc[anchor], 1e-5, 1e-5))
-    origin = wTc[anchor][:3, 3]
-    far = max(wTc, key=lambda label: float(np.linalg.norm(wTc[label][:3, 3] - origin)))
-    # Their distance alone: a held position would keep a badly placed camera where it is.
-    distance = float(np.linalg.norm(wTc[far][:3, 3] - origin))
-    if distance > 0.0:
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-3 * distance)
-        graph.add(gtsam.RangeFactorPose3(X(*anchor), X(*far), distance, noise))
-    # Median depth is 1: this only matters for points that hardly anything constrains.
-    loose = gtsam.noiseModel.Isotropic.Sigma(3, 10.0)
-    for key, point in zip(landmark_key, observations.points, strict=True):
-        graph.add(gtsam.PriorFactorPoint3(key, point, loose))
 
 
 def _start_frame(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
+
+from mvdyn_gtsam.capture.model import Camera
+from mvdyn_gtsam.errors import TrackingError
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,15 @@ class StartFrame:
 
 
 @dataclass(frozen=True)
+class FocalLength:
+    """Of a camera that does not tell it, found in the images."""
+
+    pixels: float
+    deviation: float
+    """Standard deviation, px."""
+
+
+@dataclass(frozen=True)
 class Start:
     """Rough poses over the whole video, good to about half a degree and a few percent of the depth."""
 
@@ -32,6 +44,25 @@ class Start:
     """Per camera, in time order, at least one."""
     notes: tuple[str, ...] = ()
     """What a reader of the result must know, such as cameras whose place or depth nobody could see."""
+    focal: Mapping[int, FocalLength] = field(default_factory=dict)
+    """By camera index, of those whose focal length was not known."""
+
+
+def found_cameras(cameras: Sequence[Camera], start: Start) -> tuple[Camera, ...]:
+    """The cameras with the focal lengths that the start found.
+
+    Raises TrackingError where one is neither known nor found.
+    """
+    result = list(cameras)
+    for index, camera in enumerate(cameras):
+        if index in start.focal:
+            focal = start.focal[index].pixels
+            result[index] = replace(camera, fx=focal, fy=focal)
+        elif not camera.focal_known:
+            raise TrackingError(
+                f"{camera.name}: the start did not find its focal length; give its intrinsics"
+            )
+    return tuple(result)
 
 
 def start_to_arrays(start: Start) -> dict[str, npt.NDArray[np.float64]]:
@@ -46,6 +77,9 @@ def start_to_arrays(start: Start) -> dict[str, npt.NDArray[np.float64]]:
         "count": np.array([len(frame.depth) for _, frame in frames], np.float64),
         "pixels": np.concatenate([frame.pixels for _, frame in frames]),
         "depth": np.concatenate([frame.depth for _, frame in frames]),
+        "focal": np.array(
+            [(camera, focal.pixels, focal.deviation) for camera, focal in start.focal.items()], np.float64
+        ).reshape(-1, 3),
     }
 
 
@@ -66,4 +100,9 @@ def start_from_arrays(arrays: Mapping[str, npt.NDArray[np.float64]]) -> Start:
     return Start(
         groups=tuple(tuple(np.flatnonzero(group == number).tolist()) for number in range(group.max() + 1)),
         frames=tuple(tuple(own) for own in frames),
+        # starts of earlier versions have none
+        focal={
+            int(camera): FocalLength(float(pixels), float(deviation))
+            for camera, pixels, deviation in arrays.get("focal", np.zeros((0, 3)))
+        },
     )

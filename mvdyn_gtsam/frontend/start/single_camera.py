@@ -7,21 +7,17 @@ there even where a joint one is not. What remains unknown is one similarity per 
 from __future__ import annotations
 
 import logging
-import subprocess
-import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.capture.model import Camera, Capture
-from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.start.features import Features, match_features
-from mvdyn_gtsam.frontend.start.followed_keypoints import Matches, joined_matches
+from mvdyn_gtsam.frontend.start.followed_keypoints import Matches
+from mvdyn_gtsam.frontend.start.structure_from_motion import matched_views, structure_from_motion
 from mvdyn_gtsam.geometry import invert_pose, transform_points
 
 logger = logging.getLogger(__name__)
@@ -96,27 +92,24 @@ def build_camera_map(
     camera: Camera,
     times: npt.NDArray[np.int64],
     features: Sequence[Features],
+    pairs: Matches,
     *,
-    neighbours: int,
-    ratio: float,
     minimum_angle_deg: float,
-    followed: Matches | None = None,
 ) -> CameraMap:
     """Structure from motion of camera number ``index`` alone, in a process of its own.
 
-    ``neighbours`` frames ahead are matched; ``followed`` are matches found in another way, by rows of the
-    frames. A camera whose median triangulation angle stays below
-    ``minimum_angle_deg`` is returned without points. May be called from several threads.
+    ``pairs`` are matches by rows of the frames. A camera whose median triangulation angle stays below
+    ``minimum_angle_deg`` is returned without points. May be called from several threads. Raises TrackingError
+    where the process fails.
     """
     own = tuple(features)
     without_depth = _map_without_depth(index, times, own)
-    pairs = match_neighbours(own, neighbours, ratio) if len(times) >= 3 else {}
-    pairs = joined_matches(pairs, followed or {})
-    pairs = {pair: matches for pair, matches in pairs.items() if len(matches) >= LEAST_MATCHES}
-    if not pairs:
+    pairs = usable_pairs(pairs)
+    if len(times) < 3 or not pairs:
         return without_depth
-    with tempfile.TemporaryDirectory() as folder:
-        found = _read_map(index, times, own, _solve(camera, own, pairs, Path(folder)))
+    found = _read_map(
+        index, times, own, structure_from_motion(camera.name, matched_views([camera], own, pairs))
+    )
     angle = _median_triangulation_angle_deg(found)
     logger.info(
         "%s alone: %d of %d frames, %d points, %.1f degrees of parallax",
@@ -129,23 +122,9 @@ def build_camera_map(
     return found if angle >= minimum_angle_deg else without_depth
 
 
-def _solve(
-    camera: Camera,
-    features: Sequence[Features],
-    pairs: dict[tuple[int, int], npt.NDArray[np.int64]],
-    folder: Path,
-) -> dict[str, npt.NDArray[np.float64]]:
-    """Structure from motion in a process of its own. Raises TrackingError where it fails."""
-    problem, solution = folder / "problem.npz", folder / "solution.npz"
-    _write_problem(problem, camera, features, pairs)
-    command = [sys.executable, "-m", "mvdyn_gtsam.frontend.start.sfm_worker", str(problem), str(solution)]
-    finished = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    if finished.returncode != 0:
-        log = finished.stderr.decode(errors="replace").strip().splitlines()
-        reason = log[-1] if log else f"exit code {finished.returncode}"
-        raise TrackingError(f"structure from motion of {camera.name} failed: {reason}")
-    with np.load(solution) as arrays:
-        return dict(arrays)
+def usable_pairs(pairs: Matches) -> Matches:
+    """Those with matches enough to count."""
+    return {pair: matches for pair, matches in pairs.items() if len(matches) >= LEAST_MATCHES}
 
 
 def match_neighbours(features: Sequence[Features], neighbours: int, ratio: float) -> Matches:
@@ -155,24 +134,6 @@ def match_neighbours(features: Sequence[Features], neighbours: int, ratio: float
         for second in range(first + 1, min(first + neighbours + 1, len(features))):
             pairs[first, second] = match_features(features[first], features[second], ratio)
     return pairs
-
-
-def _write_problem(
-    path: Path,
-    camera: Camera,
-    features: Sequence[Features],
-    pairs: dict[tuple[int, int], npt.NDArray[np.int64]],
-) -> None:
-    np.savez(
-        path,
-        intrinsics=[camera.fx, camera.fy, camera.cx, camera.cy],
-        size=[camera.width, camera.height],
-        count=[len(frame.pixels) for frame in features],
-        pixels=np.concatenate([frame.pixels for frame in features]),
-        pairs=np.array(list(pairs), np.int64),
-        match_count=[len(matches) for matches in pairs.values()],
-        matches=np.concatenate(list(pairs.values())),
-    )
 
 
 def _read_map(

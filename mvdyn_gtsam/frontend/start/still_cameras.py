@@ -8,23 +8,20 @@ image of an incremental structure from motion. Whoever is left gets a group, and
 from __future__ import annotations
 
 import logging
-import subprocess
-import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from mvdyn_gtsam.capture.model import Camera
-from mvdyn_gtsam.errors import ConfigError, TrackingError
+from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.start.dense_map import DenseMap
 from mvdyn_gtsam.frontend.start.features import match_features
 from mvdyn_gtsam.frontend.start.single_camera import CameraMap
 from mvdyn_gtsam.frontend.start.still_view import StillView
+from mvdyn_gtsam.frontend.start.structure_from_motion import matched_views, structure_from_motion
 from mvdyn_gtsam.frontend.start.verification import Verdict, VerificationConfig, verify_seen
 from mvdyn_gtsam.geometry import Similarity, invert_pose, project, transform_points
 
@@ -287,7 +284,8 @@ def solve_still_views(
     if not pairs:
         logger.info("still cameras: no two of them look alike enough to be connected")
         return {}, []
-    solution = _solve(views, pairs)
+    problem = matched_views([view.pinhole for view in views], [view.features for view in views], pairs)
+    solution = structure_from_motion("the still cameras", {**problem, "few_views": True})
     cTw, points = solution["cTw"], solution["points"]
     splits = np.cumsum([len(view.features.pixels) for view in views])[:-1]
     rows = np.split(solution["point_of_keypoint"].astype(np.int64), splits)
@@ -369,29 +367,3 @@ def _angle_deg(v: int, joined: Sequence[int], cTw: Array, points: Array, rows: S
             cosine = (own * ray).sum(1) / (np.linalg.norm(own, axis=1) * np.linalg.norm(ray, axis=1))
             widest[both] = np.maximum(widest[both], np.degrees(np.arccos(np.clip(cosine, -1, 1)))[both])
     return float(np.median(widest))
-
-
-def _solve(views: Sequence[StillView], pairs: Mapping[tuple[int, int], Index]) -> dict[str, Array]:
-    with tempfile.TemporaryDirectory() as folder:
-        problem, result = Path(folder) / "still.npz", Path(folder) / "still.out.npz"
-        pinholes = [view.pinhole for view in views]
-        np.savez(
-            problem,
-            intrinsics=[[p.fx, p.fy, p.cx, p.cy] for p in pinholes],
-            size=[[p.width, p.height] for p in pinholes],
-            count=[len(view.features.pixels) for view in views],
-            pixels=np.concatenate([view.features.pixels for view in views]),
-            pairs=np.array(list(pairs), np.int64),
-            match_count=[len(matches) for matches in pairs.values()],
-            matches=np.concatenate(list(pairs.values())),
-            inlier_px=2.0,
-            few_views=True,
-        )
-        command = [sys.executable, "-m", "mvdyn_gtsam.frontend.start.sfm_worker", str(problem), str(result)]
-        job = subprocess.run(command, capture_output=True, text=True)
-        if job.returncode != 0:
-            lines = job.stderr.strip().splitlines()
-            reason = lines[-1] if lines else f"exit code {job.returncode}"
-            raise TrackingError(f"structure from motion of the still cameras failed: {reason}")
-        with np.load(result) as solution:
-            return dict(solution)

@@ -63,8 +63,10 @@ def mend_placement(
     """
     short = replace(adjustment, points_per_camera=trial.points_per_camera, search_px=trial.search_px)
     sparse = [dense.sparse for dense in maps]
-    frames = adjust_maps(cameras, sparse, {0: Similarity.identity(), 1: aSb}, [(0, 1, same_point)], short)
-    wTc = {index: np.stack([frame.wTc for frame in own]) for index, own in frames.items()}
+    # with the focal lengths found so far: the dense maps, which are moved along, are made with them
+    held = [replace(camera, focal_known=True) for camera in cameras]
+    adjusted = adjust_maps(held, sparse, {0: Similarity.identity(), 1: aSb}, [(0, 1, same_point)], short)
+    wTc = {index: np.stack([frame.wTc for frame in own]) for index, own in adjusted.frames.items()}
     wSa, wSb = (similarity_of(sparse[i].mTc, wTc[i]) for i in (0, 1))
     first, second = (move_map(cameras[i], maps[i], wTc[i], dense_map) for i in (0, 1))
     return wSa.inverse().compose(wSb), (first, second)

@@ -21,12 +21,13 @@ import numpy.typing as npt
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
-from mvdyn_gtsam.frontend.start.camera_maps import map_camera
+from mvdyn_gtsam.frontend.start.camera_maps import MappedCamera, map_camera
 from mvdyn_gtsam.frontend.start.dense_map import DenseMap
+from mvdyn_gtsam.frontend.start.focal import told_focal
 from mvdyn_gtsam.frontend.start.groups import Judge, Placement, balance, connect
 from mvdyn_gtsam.frontend.start.joint_adjustment import adjust_maps
 from mvdyn_gtsam.frontend.start.lifted_points import lift_map, match_lifted
-from mvdyn_gtsam.frontend.start.model import Start, StartFrame
+from mvdyn_gtsam.frontend.start.model import FocalLength, Start, StartFrame, found_cameras
 from mvdyn_gtsam.frontend.start.placement import (
     PointMatches,
     agreeing_pairs,
@@ -35,7 +36,7 @@ from mvdyn_gtsam.frontend.start.placement import (
     same_placement,
 )
 from mvdyn_gtsam.frontend.start.settings import WideBaselineConfig
-from mvdyn_gtsam.frontend.start.single_camera import CameraMap, choose_frames
+from mvdyn_gtsam.frontend.start.single_camera import choose_frames
 from mvdyn_gtsam.frontend.start.still_cameras import SamePoint, place_still_cameras
 from mvdyn_gtsam.frontend.start.still_view import StillView, build_still_view, frames_of_view, lone_frames
 from mvdyn_gtsam.frontend.start.trial import mend_placement
@@ -83,7 +84,10 @@ class ClassicalInitializer:
         """See ``WideBaselineInitializer``."""
         progress = progress if progress is not None else NullProgress()
         config = self.config
-        maps, dense = self._maps(capture, progress)
+        mapped = self._maps(capture, progress)
+        capture = replace(capture, cameras=tuple(own.camera for own in mapped))
+        maps = [own.sparse for own in mapped]
+        dense = {index: own.dense for index, own in enumerate(mapped) if own.dense is not None}
         links, matches = self._links(capture, dense, progress)
         more, matches, lifted = self._look_again(capture, dense, links, matches)
         links += more
@@ -104,6 +108,7 @@ class ClassicalInitializer:
             for index, camera in enumerate(capture.cameras)
         ]
         frames: dict[int, tuple[StartFrame, ...]] = {}
+        focal: dict[int, FocalLength] = {}
         for group in placed.groups:
             same_point: list[SamePoint] = [
                 (a, b, self._same_points(capture, matches[a, b], a, b, group))
@@ -112,14 +117,20 @@ class ClassicalInitializer:
             ]
             same_point += [pairs for pairs in placed.same_point if pairs[0] in group and pairs[1] in group]
             adjustment = config.adjustment
-            if any(camera in placed.maps for camera in group):
-                # One view from far aside converges along a narrow valley: an early end was 15 cm off.
+            if any(camera in placed.maps or not cameras[camera].focal_known for camera in group):
+                # One view from far aside, and a focal length, converge along a narrow valley: an early end
+                # was 15 cm off.
                 adjustment = replace(adjustment, maximum_iterations=100, relative_tolerance=1e-5)
-            frames |= adjust_maps(cameras, maps, group, same_point, adjustment)
+            adjusted = adjust_maps(cameras, maps, group, same_point, adjustment)
+            frames |= adjusted.frames
+            focal |= told_focal(adjusted)
         for camera in placed.maps:
             frames[camera] = frames_of_view(views[camera], capture.cameras[camera], frames[camera][0])
         groups = [tuple(sorted(group)) for group in placed.groups]
-        start = Start(tuple(groups), tuple(frames.get(camera, ()) for camera in range(len(maps))))
+        start = Start(
+            tuple(groups), tuple(frames.get(camera, ()) for camera in range(len(maps))), focal=focal
+        )
+        capture = replace(capture, cameras=found_cameras(capture.cameras, start))
         return _with_lone_cameras(capture, start, views)
 
     def _still_views(self, capture: Capture, cameras: Sequence[int]) -> dict[int, StillView]:
@@ -150,25 +161,22 @@ class ClassicalInitializer:
         intrinsics_a, intrinsics_b = capture.cameras[a].intrinsics, capture.cameras[b].intrinsics
         return agreeing_pairs(matches, aSb, intrinsics_a, intrinsics_b, self.config.placement)
 
-    def _maps(self, capture: Capture, progress: Progress) -> tuple[list[CameraMap], dict[int, DenseMap]]:
-        """The map of every camera, and its dense depth where it has any; cameras side by side."""
+    def _maps(self, capture: Capture, progress: Progress) -> list[MappedCamera]:
+        """The map of every camera; cameras side by side."""
         cameras = range(len(capture.cameras))
-        maps: list[CameraMap] = []
-        dense: dict[int, DenseMap] = {}
+        maps: list[MappedCamera] = []
         # any other flow than one that may be called from several threads gets one caller
         workers = flow_threads() if isinstance(self.flow, OneWayFlow) else 1
         mapped = partial(map_camera, capture, flow=self.flow, config=self.config)
         with ThreadPoolExecutor(workers) as pool:
             try:
-                for camera, (own, own_dense) in enumerate(pool.map(mapped, cameras)):
+                for own in pool.map(mapped, cameras):
                     maps.append(own)
-                    if own_dense is not None:
-                        dense[camera] = own_dense
-                    progress.update("start", camera + 1, 2 * len(cameras), "one map per camera")
+                    progress.update("start", len(maps), 2 * len(cameras), "one map per camera")
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
-        return maps, dense
+        return maps
 
     def _links(
         self, capture: Capture, dense: Mapping[int, DenseMap], progress: Progress

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from mvdyn_gtsam.errors import ConfigError
 from mvdyn_gtsam.frontend.rig import RigConfig, likely_mounts
+from mvdyn_gtsam.frontend.start.bundle import Observations
 from mvdyn_gtsam.frontend.start.features import Features
 from mvdyn_gtsam.frontend.start.joint_adjustment import (
     AdjustmentConfig,
-    Observations,
     _choose_points,
     _merge,
     _search,
@@ -59,7 +59,8 @@ def common_points(maps: list[CameraMap], count: int) -> npt.NDArray[np.int64]:
 @pytest.fixture(scope="module")
 def adjusted(maps: list[CameraMap]) -> dict[int, tuple[StartFrame, ...]]:
     group = {0: IDENTITY, 1: IDENTITY}
-    return adjust_maps([CAMERA, CAMERA], maps, group, [(0, 1, common_points(maps, 12))], AdjustmentConfig())
+    pairs = [(0, 1, common_points(maps, 12))]
+    return adjust_maps([CAMERA, CAMERA], maps, group, pairs, AdjustmentConfig()).frames
 
 
 def stacked(frames: dict[int, tuple[StartFrame, ...]]) -> Array:
@@ -114,7 +115,7 @@ def test_depths_are_those_of_the_points_seen(
 
 
 def test_one_camera_alone_is_adjusted_too(maps: list[CameraMap]) -> None:
-    frames = adjust_maps([CAMERA], maps[:1], {0: IDENTITY}, [], AdjustmentConfig())
+    frames = adjust_maps([CAMERA], maps[:1], {0: IDENTITY}, [], AdjustmentConfig()).frames
     wTc = np.stack([frame.wTc for frame in frames[0]])
     own, true = (invert_pose(one[0]) @ one for one in (wTc, TRUTH[0]))
     assert rotation_angle_deg((invert_pose(true) @ own)[:, :3, :3]).max() < 0.3
@@ -212,7 +213,7 @@ def adjusted_pair(wTa: Array, wTb: Array, rig: RigConfig) -> Array:
         maps.append(replace(exact, mTc=growing))
     group = {0: IDENTITY, 1: IDENTITY}
     pairs = [(0, 1, common_points(maps, 12))]
-    frames = adjust_maps([CAMERA, CAMERA], maps, group, pairs, AdjustmentConfig(rig=rig))
+    frames = adjust_maps([CAMERA, CAMERA], maps, group, pairs, AdjustmentConfig(rig=rig)).frames
     a, b = (np.stack([frame.wTc for frame in frames[camera]]) for camera in (0, 1))
     return invert_pose(a) @ b
 

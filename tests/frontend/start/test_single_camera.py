@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from mvdyn_gtsam.capture.model import Camera, Capture
-from mvdyn_gtsam.errors import TrackingError
-from mvdyn_gtsam.frontend.start import single_camera
 from mvdyn_gtsam.frontend.start.features import Features, extract_features
 from mvdyn_gtsam.frontend.start.single_camera import (
     CameraMap,
     _median_triangulation_angle_deg,
     build_camera_map,
     choose_frames,
+    match_neighbours,
 )
 from mvdyn_gtsam.geometry import invert_pose, project, rotation_angle_deg, transform_points
 from tests.frontend.textures import texture
@@ -88,11 +87,15 @@ def maps_of(scene: Scene, minimum_angle_deg: float = 1.0) -> list[CameraMap]:
     times = [np.arange(len(track)) for track in scene.images]
     return [
         build_camera_map(
-            index, camera, times[index], features[index], neighbours=4, ratio=0.8,
+            index,
+            camera,
+            times[index],
+            features[index],
+            match_neighbours(features[index], 4, 0.8),
             minimum_angle_deg=minimum_angle_deg,
         )
         for index, camera in enumerate(scene.cameras)
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.slow
@@ -142,30 +145,12 @@ def test_two_frames_or_no_matches_are_no_map() -> None:
     camera = panning([0, 1]).cameras[0]
     same = noise()
     maps = [
-        build_camera_map(index, camera, times, features, neighbours=4, ratio=0.8, minimum_angle_deg=1.0)
+        build_camera_map(
+            index, camera, times, features, match_neighbours(features, 4, 0.8), minimum_angle_deg=1.0
+        )
         for index, (times, features) in enumerate(
             [(np.array([0, 9]), [same, same]), (np.arange(4), [noise() for _ in range(4)])]
         )
     ]
     assert [one.has_depth for one in maps] == [False, False]
     assert [one.camera for one in maps] == [0, 1]
-
-
-def test_a_worker_that_fails_is_one_line_with_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(path: object, *_: object) -> None:
-        with open(str(path), "w") as file:
-            file.write("not a problem")
-
-    monkeypatch.setattr(single_camera, "_write_problem", broken)
-    view = extract_features(np.repeat(texture((192, 256))[..., None], 3, axis=2), 300, 0.01)
-    with pytest.raises(TrackingError, match="structure from motion of pan failed: ") as raised:
-        build_camera_map(
-            0,
-            panning([0, 1]).cameras[0],
-            np.arange(3),
-            [view] * 3,
-            neighbours=2,
-            ratio=0.8,
-            minimum_angle_deg=1.0,
-        )
-    assert "\n" not in str(raised.value)

@@ -314,7 +314,8 @@ def test_joint_adjustment_moves_a_badly_placed_camera() -> None:
     off[:3, 3] += [0.05, -0.03, 0.04]
     group = {0: Similarity.identity(), 1: Similarity(1.0, off[:3, :3], off[:3, 3])}
     pairs = np.column_stack([rows, np.arange(len(rows))])
-    frames = adjust_maps([CAMERA, CAMERA], [moving, still], group, [(0, 1, pairs)], AdjustmentConfig())
+    adjusted = adjust_maps([CAMERA, CAMERA], [moving, still], group, [(0, 1, pairs)], AdjustmentConfig())
+    frames = adjusted.frames
     angle, direction = relative_error(
         invert_pose(frames[0][0].wTc), invert_pose(frames[1][0].wTc), poses[0], wTr
     )

@@ -1,0 +1,154 @@
+"""The factor graph of a bundle adjustment: sightings, gauge, mounts, and focal lengths that are yet to be
+found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from factors.keys import F, X
+from factors.priors import pose_prior
+from mvdyn_gtsam.capture.model import Camera
+from mvdyn_gtsam.frontend.rig import Pair, add_mounts
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Label = tuple[int, int]
+"""Camera and row of one of its map's frames."""
+
+ROBUST_PX = 1.0
+"""Cauchy scale of reprojection errors; SIFT is good to about half a pixel."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Every sighting of every landmark; rows belong together."""
+
+    landmark: Index
+    """``(M,)`` row in ``points``."""
+    camera: Index
+    """``(M,)``"""
+    frame: Index
+    """``(M,)`` row in that camera's map."""
+    pixel: Array
+    """``(M, 2)`` px"""
+    points: Array
+    """``(P, 3)`` in the world."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """The graph of some sightings and the values that it begins with."""
+
+    sightings: gtsam.NonlinearFactorGraph
+    """Reprojection factors alone: what the images say."""
+    graph: gtsam.NonlinearFactorGraph
+    """With what holds the gauge."""
+    values: gtsam.Values
+    landmarks: list[int]
+    """Keys."""
+
+
+def bundle_of(cameras: Sequence[Camera], wTc: Mapping[Label, Array], observations: Observations) -> Bundle:
+    """One reprojection factor per sighting; the focal lengths of cameras that do not tell them are free."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for (camera, frame), pose in wTc.items():
+        values.insert(X(camera, frame), gtsam.Pose3(pose))
+    landmark_key = [gtsam.symbol("l", index) for index in range(len(observations.points))]
+    for key, point in zip(landmark_key, observations.points, strict=True):
+        values.insert(key, point)
+    noise = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST_PX), gtsam.noiseModel.Isotropic.Sigma(2, 1.0)
+    )
+    calibrations = [gtsam.Cal3_S2(c.fx, c.fy, 0.0, c.cx, c.cy) for c in cameras]
+    for free in free_cameras(cameras, wTc):
+        values.insert(F(free), gtsam.Cal3f(cameras[free].fx, cameras[free].cx, cameras[free].cy))
+    for landmark, camera, frame, pixel in zip(
+        observations.landmark.tolist(),
+        observations.camera.tolist(),
+        observations.frame.tolist(),
+        observations.pixel,
+        strict=True,
+    ):
+        keys = X(camera, frame), landmark_key[landmark]
+        if cameras[camera].focal_known:
+            known = calibrations[camera]
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, *keys, known, False, False))
+        else:
+            graph.add(gtsam.GeneralSFMFactor2Cal3f(pixel, noise, *keys, F(camera)))
+    gauged = gtsam.NonlinearFactorGraph(graph)
+    _fix_gauge(gauged, wTc, observations, landmark_key)
+    return Bundle(graph, gauged, values, landmark_key)
+
+
+def free_cameras(cameras: Sequence[Camera], wTc: Mapping[Label, Array]) -> list[int]:
+    """Those with frames ``wTc`` whose focal lengths are solved for."""
+    return [camera for camera in sorted({label[0] for label in wTc}) if not cameras[camera].focal_known]
+
+
+def solved_cameras(
+    cameras: Sequence[Camera], wTc: Mapping[Label, Array], solution: gtsam.Values
+) -> tuple[Camera, ...]:
+    """The cameras with the focal lengths of a solution."""
+    result = list(cameras)
+    for camera in free_cameras(cameras, wTc):
+        focal = solution.atCal3f(F(camera)).fx()
+        result[camera] = replace(cameras[camera], fx=focal, fy=focal)
+    return tuple(result)
+
+
+def focal_deviations(bundle: Bundle, solution: gtsam.Values, cameras: Sequence[int]) -> dict[int, float]:
+    """Standard deviations of the focal lengths of free ``cameras``, px, for sightings good to ``ROBUST_PX``;
+    infinite where the images leave one open."""
+    if not cameras:
+        return {}
+    try:
+        marginals = gtsam.Marginals(bundle.graph, solution)
+        return {camera: float(np.sqrt(marginals.marginalCovariance(F(camera))[0, 0])) for camera in cameras}
+    except RuntimeError:  # gtsam: an indeterminate system
+        return dict.fromkeys(cameras, np.inf)
+
+
+def solve_bundle(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    times: Mapping[Label, int],
+    mounts: Mapping[Pair, Array],
+    iterations: int,
+    tolerance: float,
+) -> gtsam.Values:
+    """At most so many ``iterations`` of Levenberg-Marquardt, until the cost falls by a share less than
+    ``tolerance``, with ``mounts`` held; ``graph`` and ``values`` stay as they are."""
+    if mounts:
+        graph, values = gtsam.NonlinearFactorGraph(graph), gtsam.Values(values)
+        add_mounts(graph, values, mounts, [((label[0], time), X(*label)) for label, time in times.items()])
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    parameters.setRelativeErrorTol(tolerance)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+
+
+def _fix_gauge(
+    graph: gtsam.NonlinearFactorGraph,
+    wTc: Mapping[Label, Array],
+    observations: Observations,
+    landmark_key: list[int],
+) -> None:
+    """Hold one pose, and the scale by its distance to the farthest; a breath of a prior on every point."""
+    anchor = min(wTc)
+    graph.add(pose_prior(X(*anchor), wTc[anchor], 1e-5, 1e-5))
+    origin = wTc[anchor][:3, 3]
+    far = max(wTc, key=lambda label: float(np.linalg.norm(wTc[label][:3, 3] - origin)))
+    # Their distance alone: a held position would keep a badly placed camera where it is.
+    distance = float(np.linalg.norm(wTc[far][:3, 3] - origin))
+    if distance > 0.0:
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, 1e-3 * distance)
+        graph.add(gtsam.RangeFactorPose3(X(*anchor), X(*far), distance, noise))
+    # Median depth is 1: this only matters for points that hardly anything constrains.
+    loose = gtsam.noiseModel.Isotropic.Sigma(3, 10.0)
+    for key, point in zip(landmark_key, observations.points, strict=True):
+        graph.add(gtsam.PriorFactorPoint3(key, point, loose))

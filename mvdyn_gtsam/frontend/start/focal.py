@@ -1,0 +1,85 @@
+"""The focal length of a camera that does not tell it, from its own video.
+
+Bundle adjustment with a free focal length ends in one of several minima where texture repeats or things move.
+So it begins from several guesses, and the one that most sightings fit is believed, unless the video leaves
+the focal length open.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mvdyn_gtsam.capture.model import Camera
+from mvdyn_gtsam.errors import TrackingError
+from mvdyn_gtsam.frontend.start.features import Features
+from mvdyn_gtsam.frontend.start.followed_keypoints import Matches
+from mvdyn_gtsam.frontend.start.joint_adjustment import Adjusted
+from mvdyn_gtsam.frontend.start.model import FocalLength
+from mvdyn_gtsam.frontend.start.structure_from_motion import matched_views, structure_from_motion
+
+logger = logging.getLogger(__name__)
+
+FOCAL_GUESSES = (0.6, 0.95, 1.2, 1.7)
+"""Focal lengths tried besides the camera's own guess, in lengths of the longer side: fields of view of 80 to
+45 degrees, each within reach of the next. Source: experiments/focal.py."""
+
+MOST_DEVIATION = 0.01
+"""Standard deviation from which on a focal length is not told, as a share of it. Source:
+experiments/focal.py."""
+
+
+def with_found_focal(camera: Camera, features: Sequence[Features], pairs: Matches) -> Camera:
+    """The camera with the focal length that its frames' ``features`` and the matches of their ``pairs`` speak
+    for; may be called from several threads.
+
+    Raises TrackingError where they speak for none.
+    """
+    side = max(camera.width, camera.height)
+    guesses = np.array([camera.fx, *(share * side for share in FOCAL_GUESSES)])
+    found = {"focal": np.full(0, np.nan), "fitting": np.zeros(0, int)}
+    if pairs:
+        problem = {**matched_views([camera], features, pairs), "focal_guesses": guesses}
+        found = structure_from_motion(camera.name, problem)
+    known = np.isfinite(found["focal"])
+    if not known.any():
+        raise no_focal(camera, "no map can be made of it: it shows too little, or hardly any motion")
+    best = int(np.argmax(np.where(known, found["fitting"], -1)))
+    focal = float(found["focal"][best])
+    logger.info(
+        "%s: focal length %.1f px; from guesses %s ended %s, fitting sightings %s",
+        camera.name,
+        focal,
+        np.round(guesses).astype(int).tolist(),
+        np.round(found["focal"], 1).tolist(),
+        found["fitting"].tolist(),
+    )
+    return replace(camera, fx=focal, fy=focal)
+
+
+def told_focal(adjusted: Adjusted) -> dict[int, FocalLength]:
+    """The focal lengths that a joint adjustment found, by camera.
+
+    Raises TrackingError where the images leave one open.
+    """
+    told = {}
+    for index, deviation in adjusted.focal_deviation.items():
+        camera = adjusted.cameras[index]
+        if not deviation < MOST_DEVIATION * camera.fx:
+            raise no_focal(
+                camera, f"{camera.fx:.0f} px fits best, give or take {100.0 * deviation / camera.fx:.0f} %"
+            )
+        logger.info("%s: focal length %.1f px, give or take %.1f", camera.name, camera.fx, deviation)
+        told[index] = FocalLength(camera.fx, deviation)
+    return told
+
+
+def no_focal(camera: Camera, reason: str) -> TrackingError:
+    """What is to be raised where a video does not tell the focal length."""
+    return TrackingError(
+        f"{camera.name}: its video does not tell its focal length ({reason}); give its intrinsics, from a"
+        " calibration, or from another video of the same phone and zoom"
+    )
