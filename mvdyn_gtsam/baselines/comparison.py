@@ -17,8 +17,8 @@ from mvdyn_gtsam.baselines.masks import find_masks
 from mvdyn_gtsam.baselines.process import ProcessUsage, run_measured
 from mvdyn_gtsam.baselines.results import Comparison, MethodResult
 from mvdyn_gtsam.baselines.runner import log_path, run_worker
-from mvdyn_gtsam.baselines.settings import BASELINES, BaselineSettings, Request
-from mvdyn_gtsam.capture import Capture, open_capture
+from mvdyn_gtsam.baselines.settings import ALL_FOCALS_REFINED, BASELINES, BaselineSettings, Request
+from mvdyn_gtsam.capture import Capture, open_capture, with_unknown_focal
 from mvdyn_gtsam.errors import BaselineError, MvdynError
 from mvdyn_gtsam.evaluation import GroundTruth, ReconstructionLike, evaluate, load_groundtruth
 from mvdyn_gtsam.evaluation.comparison_plots import save_comparison_plots
@@ -37,6 +37,7 @@ class _Inputs:
     capture: Path
     stage: str
     truncate: bool
+    estimate_focal: bool
     timeout_s: float | None
     our_arguments: Sequence[str]
     database: Path | None
@@ -59,6 +60,7 @@ def compare(
     database: Path | None = None,
     share_matches: bool = False,
     truncate: bool = False,
+    estimate_focal: bool = False,
     timeout_s: float | None = None,
     our_arguments: Sequence[str] = (),
     plots: bool = True,
@@ -76,23 +78,28 @@ def compare(
     ``descriptor`` and ``retrieval_pairs`` those with retrieval; ``pairing`` is the method's. With
     ``database``, a folder that is kept, baselines of equal settings share frames, features and matches, in
     this comparison and later ones of the same capture; ``share_matches`` does so for this one alone. What is
-    taken over counts in time and memory of each. ``our_arguments`` are added to our command.
+    taken over counts in time and memory of each. With ``estimate_focal`` every method that is run has to find
+    the focal lengths, whatever the capture knows. ``our_arguments`` are added to our command.
 
     Raises BaselineError for an unknown method and for masks or a descriptor that are missing, EvaluationError
-    for unusable ground truth, ResultError for an imported result that is none: all before anything runs. A
-    method that fails becomes a row that says so.
+    for unusable ground truth, ResultError for an imported result that is none, CaptureError for a camera with
+    distortion and ``estimate_focal``: all before anything runs. A method that fails becomes a row that says
+    so.
     """
     paths = dict(imported or {})
     methods = list(dict.fromkeys(methods))
     _check_names(methods, paths)
     truth = None if groundtruth is None else load_groundtruth(groundtruth)
     base = settings or BaselineSettings()
-    needs_capture = paths or any(BASELINES[m].masked for m in methods if m != OURS)
+    needs_capture = paths or estimate_focal or any(BASELINES[m].masked for m in methods if m != OURS)
     opened = open_capture(capture, truncate=truncate) if needs_capture else None
+    if opened is not None and estimate_focal:
+        with_unknown_focal(opened)  # refuses what no method can do without them
     inputs = _Inputs(
         capture=capture,
         stage=stage,
         truncate=truncate,
+        estimate_focal=estimate_focal,
         timeout_s=timeout_s,
         our_arguments=our_arguments,
         database=out / "matches" if share_matches and database is None else database,
@@ -173,6 +180,7 @@ def _row(method: str, inputs: _Inputs, out: Path, truth: GroundTruth | None) -> 
     folder = out / method
     if method == OURS:
         extra = [*(["--truncate"] if inputs.truncate else []), *inputs.our_arguments]
+        extra += ["--estimate-focal"] if inputs.estimate_focal else []
         usage = _run_ours(inputs.capture, folder, inputs.stage, extra, inputs.timeout_s)
     else:
         request = Request(
@@ -182,6 +190,7 @@ def _row(method: str, inputs: _Inputs, out: Path, truth: GroundTruth | None) -> 
             inputs.settings[method],
             inputs.database,
             inputs.truncate,
+            inputs.estimate_focal,
         )
         usage = run_worker(request, inputs.timeout_s)
     return _result(method, folder, usage, inputs, truth)
@@ -198,11 +207,13 @@ def _result(
     method: str, folder: Path, usage: ProcessUsage | None, inputs: _Inputs, truth: GroundTruth | None
 ) -> MethodResult:
     problem = None if usage is None else usage.problem
-    scores, registered = None, 0.0
+    scores, registered, note = None, 0.0, None
     if problem is None:
         try:
             reconstruction = inputs.imported[method] if usage is None else Reconstruction.load(folder)
             registered = _registered(reconstruction)
+            if isinstance(reconstruction, Reconstruction):
+                note = ALL_FOCALS_REFINED if ALL_FOCALS_REFINED in reconstruction.manifest["notes"] else None
             scores = None if truth is None else evaluate(reconstruction, truth)
         except MvdynError as error:
             problem = str(error)
@@ -217,6 +228,7 @@ def _result(
         peak_mb=None if usage is None else usage.peak_mb,
         folder=folder,
         registered=registered,
+        note=note,
     )
 
 

@@ -34,6 +34,8 @@ class MethodResult:
     """Where its result lies."""
     registered: float = 0.0
     """Fraction of frames with a pose; a method that failed registered none."""
+    note: str | None = None
+    """What a reader of its row must know of how it was made."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,7 @@ class Comparison:
         partial = [r.method for r in self.results if r.problem is None and r.registered < 1.0]
         if partial:
             notes.append(f"{', '.join(partial)}: incomplete; the errors leave out the frames without a pose.")
+        notes += [f"{r.method}: {r.note}" for r in self.results if r.note is not None]
         for result in self.results:
             depth = None if result.scores is None else result.scores.depth
             if depth is not None and 0 < depth.frames_without_estimate < depth.frames:

@@ -50,10 +50,12 @@ def run_baseline(
     settings: BaselineSettings | None = None,
     database: Path | None = None,
     truncate: bool = False,
+    estimate_focal: bool = False,
     timeout_s: float | None = None,
 ) -> BaselineResult:
     """Reconstruct the capture folder with COLMAP (incremental) or GLOMAP (global mapping).
 
+    Focal lengths that the capture does not know, or none with ``estimate_focal``, are left to the method.
     ``database`` names a folder where frames, features and matches are kept: the next method given the same
     folder, capture and settings starts from them, and their time and memory count for both. The log is
     ``<out>.log``. Raises BaselineError, with the reason in one line, when the method fails or finds no model;
@@ -61,7 +63,9 @@ def run_baseline(
     """
     if method not in METHODS:
         raise BaselineError(f"method {method!r} is none of {', '.join(METHODS)}")
-    request = Request(capture, method, out, settings or BaselineSettings(), database, truncate)
+    request = Request(
+        capture, method, out, settings or BaselineSettings(), database, truncate, estimate_focal
+    )
     usage = run_worker(request, timeout_s)
     if usage.problem is not None:
         raise BaselineError(f"{method}: {usage.problem}; log: {log_path(out)}")

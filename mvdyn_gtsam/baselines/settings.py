@@ -16,6 +16,9 @@ METHODS: tuple[Method, ...] = ("colmap", "glomap")
 RESULT_NAME = "baseline.json"
 """What the worker leaves in its folder besides the reconstruction: seconds per phase, number of points."""
 
+ALL_FOCALS_REFINED = "every focal length was refined, those that are known, too: GLOMAP can hold all or none."
+"""Note of a result for which some focal lengths were known."""
+
 Pairing = Literal["window", "retrieval", "exhaustive"]
 
 
@@ -86,6 +89,8 @@ class Request:
     database: Path | None = None
     """Folder that keeps frames, features and matches of each capture and settings for other methods."""
     truncate: bool = False
+    estimate_focal: bool = False
+    """No focal length of the capture counts as known."""
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -95,6 +100,7 @@ class Request:
             "settings": self.settings.to_json(),
             "database": None if self.database is None else str(self.database),
             "truncate": self.truncate,
+            "estimate_focal": self.estimate_focal,
         }
 
     @staticmethod
@@ -108,4 +114,5 @@ class Request:
             settings=BaselineSettings.from_json(values["settings"]),
             database=None if values["database"] is None else Path(values["database"]),
             truncate=bool(values["truncate"]),
+            estimate_focal=bool(values["estimate_focal"]),
         )

@@ -7,6 +7,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,9 @@ from mvdyn_gtsam.errors import BaselineError, CaptureError
 from mvdyn_gtsam.geometry import invert_pose
 
 Array = npt.NDArray[np.float64]
+
+PIXEL_CENTRE = 0.5
+"""COLMAP puts the centre of the first pixel at 0.5."""
 
 
 def image_name(camera: str, time: int) -> str:
@@ -70,14 +75,21 @@ def extract_features(
     settings: BaselineSettings,
     masks: Path | None = None,
 ) -> None:
-    """SIFT on the CPU with COLMAP's defaults; one PINHOLE camera per device with its known intrinsics."""
+    """SIFT on the CPU with COLMAP's defaults; one PINHOLE camera per device with its known intrinsics.
+
+    A camera of unknown focal length is a SIMPLE_PINHOLE whose focal length is COLMAP's default, not known.
+    """
     pycolmap.set_random_seed(settings.random_seed)
     extraction = pycolmap.FeatureExtractionOptions(num_threads=settings.num_threads, use_gpu=False)
     for camera in cameras:
         reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = "PINHOLE"
-        # COLMAP's pixel centres are at +0.5.
-        reader.camera_params = f"{camera.fx!r},{camera.fy!r},{camera.cx + 0.5!r},{camera.cy + 0.5!r}"
+        if camera.focal_known:
+            reader.camera_model = "PINHOLE"
+            principal_point = f"{camera.cx + PIXEL_CENTRE!r},{camera.cy + PIXEL_CENTRE!r}"
+            reader.camera_params = f"{camera.fx!r},{camera.fy!r},{principal_point}"
+        else:
+            # Whatever is given as parameters counts as known.
+            reader.camera_model = "SIMPLE_PINHOLE"
         if masks is not None:
             reader.mask_path = str(masks)
         pycolmap.extract_features(
@@ -89,6 +101,20 @@ def extract_features(
             extraction_options=extraction,
             device=pycolmap.Device.cpu,
         )
+        if not camera.focal_known:
+            _set_principal_point(camera, database)
+
+
+def _set_principal_point(camera: Camera, database: Path) -> None:
+    with pycolmap.Database.open(database) as opened:
+        stored = opened.read_camera(_camera_id(camera, opened))
+        stored.principal_point_x = camera.cx + PIXEL_CENTRE
+        stored.principal_point_y = camera.cy + PIXEL_CENTRE
+        opened.update_camera(stored)
+
+
+def _camera_id(camera: Camera, database: Any) -> int:
+    return int(database.read_image_with_name(image_name(camera.name, 0)).camera_id)
 
 
 def pairs_to_match(cameras: list[str], frame_count: int, settings: BaselineSettings) -> list[tuple[str, str]]:
@@ -125,17 +151,39 @@ def match_features(pairs: list[tuple[str, str]], database: Path, settings: Basel
     )
 
 
-def reconstruct(method: Method, images: Path, database: Path, out: Path, settings: BaselineSettings) -> Any:
-    """Largest model found, intrinsics held fixed.
+def reconstruct(
+    method: Method,
+    images: Path,
+    database: Path,
+    out: Path,
+    settings: BaselineSettings,
+    cameras: Sequence[Camera] = (),
+) -> Any:
+    """Largest model found, intrinsics held fixed but for the focal lengths that ``cameras`` do not know.
 
+    GLOMAP refines those that are known along with them. The database is changed.
     Raises BaselineError when no model was found.
     """
     out.mkdir(parents=True, exist_ok=True)
     pycolmap.set_random_seed(settings.random_seed)
+    refine_focal = not all(camera.focal_known for camera in cameras)
     if method == "colmap":
-        models = pycolmap.incremental_mapping(database, images, out, options=_incremental_options(settings))
+        options = _incremental_options(settings)
+        if refine_focal:
+            options.ba_refine_focal_length = True
+            options.mapper.abs_pose_refine_focal_length = True
+            with pycolmap.Database.open(database) as opened:
+                options.constant_cameras = {_camera_id(c, opened) for c in cameras if c.focal_known}
+        models = pycolmap.incremental_mapping(database, images, out, options=options)
     else:
-        models = pycolmap.global_mapping(database, images, out, options=_global_options(settings))
+        options = _global_options(settings)
+        if refine_focal:
+            # As COLMAP says to where focal lengths are not known: global mapping alone does not find them.
+            calibration = pycolmap.ViewGraphCalibrationOptions(random_seed=settings.random_seed)
+            if not pycolmap.calibrate_view_graph(database, calibration):
+                raise BaselineError(f"{method} found no focal lengths in the view graph")
+            options.mapper.bundle_adjustment.refine_focal_length = True
+        models = pycolmap.global_mapping(database, images, out, options=options)
     if not models:
         raise BaselineError(f"{method} found no model")
     return max(models.values(), key=lambda model: model.num_reg_images())
@@ -168,6 +216,19 @@ def _global_options(settings: BaselineSettings) -> Any:
     adjustment.ceres.use_gpu = False
     adjustment.ceres.solver_options.num_threads = settings.num_threads
     return options
+
+
+def read_cameras(model: Any, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """``cameras`` with the focal lengths of the model, where some were unknown and it has frames of them."""
+    if all(camera.focal_known for camera in cameras):
+        return tuple(cameras)
+    found = {image.name.split("/")[0]: model.cameras[image.camera_id] for image in model.images.values()}
+    return tuple(
+        replace(camera, fx=found[camera.name].focal_length_x, fy=found[camera.name].focal_length_y)
+        if camera.name in found
+        else camera
+        for camera in cameras
+    )
 
 
 def read_trajectories(model: Any, cameras: list[str], frame_count: int) -> dict[str, Array]:

@@ -3,13 +3,15 @@
 from mvdyn_gtsam.capture.convert import write_capture
 from mvdyn_gtsam.capture.dispatch import open_capture
 from mvdyn_gtsam.capture.euroc import load_euroc
+from mvdyn_gtsam.capture.focal import with_unknown_focal
 from mvdyn_gtsam.capture.folder_per_camera import load_folder_per_camera
 from mvdyn_gtsam.capture.loader import capture_from_cameras, load_capture
-from mvdyn_gtsam.capture.model import Camera, Capture, FrameStream
+from mvdyn_gtsam.capture.model import FIRST_FOCAL, Camera, Capture, FrameStream
 from mvdyn_gtsam.capture.multicamvideo import convert_multicamvideo, load_multicamvideo, multicamvideo_poses
 from mvdyn_gtsam.capture.streams import ImageStream, UndistortedStream, VideoStream
 
 __all__ = [
+    "FIRST_FOCAL",
     "Camera",
     "Capture",
     "FrameStream",
@@ -24,5 +26,6 @@ __all__ = [
     "load_multicamvideo",
     "multicamvideo_poses",
     "open_capture",
+    "with_unknown_focal",
     "write_capture",
 ]

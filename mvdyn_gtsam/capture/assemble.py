@@ -6,7 +6,7 @@ import logging
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from mvdyn_gtsam.capture.images import natural_key
@@ -147,6 +147,11 @@ def _check_size(source: Source) -> None:
     camera, media = source.camera, source.media
     if (media.width, media.height) == (camera.width, camera.height):
         return
+    if not camera.focal_known:
+        raise CaptureError(
+            f"{media.label}: frames are {media.width}x{media.height}, but camera {camera.name} is said to "
+            f"have {camera.width}x{camera.height}; correct its width and height, and cx, cy if given"
+        )
     message = (
         f"{media.label}: frames are {media.width}x{media.height}, but camera {camera.name} has intrinsics "
         f"for {camera.width}x{camera.height}; scale the intrinsics to the frames"
@@ -267,8 +272,3 @@ def _finish(source: Source, first: int, count: int) -> FrameStream:
     if any(source.camera.distortion):
         stream = UndistortedStream(stream, source.camera.intrinsics, source.camera.distortion)
     return stream
-
-
-def with_media_size(camera: Camera, media: MediaStream) -> Camera:
-    """``camera`` with the width and height of its media, where the source states none."""
-    return replace(camera, width=media.width, height=media.height)

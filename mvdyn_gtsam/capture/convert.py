@@ -22,9 +22,9 @@ def write_capture(capture: Capture, out: Path, *, poses: Mapping[str, Array] | N
     """Write ``capture`` to the new folder ``out``: lossless images, ``capture.json``, TUM ground truth.
 
     Images are written as handed out, undistorted and cut to the common range, so the written cameras have
-    neither distortion nor time offset. ``poses`` maps camera names to ``wTc (T, 4, 4)``. The folder appears
-    under its name only when complete. Raises CaptureError where ``out`` exists or cannot be written, or
-    poses and frames differ in number.
+    neither distortion nor time offset; an unknown focal length stays unknown. ``poses`` maps camera names to
+    ``wTc (T, 4, 4)``. The folder appears under its name only when complete. Raises CaptureError where ``out``
+    exists or cannot be written, or poses and frames differ in number.
     """
     out = Path(out)
     for name, wTc in (poses or {}).items():
@@ -75,6 +75,7 @@ def _write(capture: Capture, folder: Path, poses: Mapping[str, Array]) -> None:
                 "name": camera.name,
                 "source": f"{camera.name}/*.png",
                 **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+                **({} if camera.focal_known else {"estimate_focal": True}),
             }
             for camera in capture.cameras
         ],

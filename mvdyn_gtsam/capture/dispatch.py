@@ -42,7 +42,10 @@ def open_capture(
         _refuse(path, CAPTURE_FILE, cameras=cameras, fps=fps, focal_mm=focal_mm)
         return load_capture(path, truncate=truncate)
     if path.is_file():
-        raise CaptureError(f"{path}: is a single file; give each video with --camera and its --intrinsics")
+        raise CaptureError(
+            f"{path}: is a single file; give each video with --camera and its --intrinsics, or"
+            " with --camera and --estimate-focal"
+        )
     if is_euroc(path):
         _refuse(path, "EuRoC", fps=fps, focal_mm=focal_mm)
         return replace(load_euroc(path, cameras=cameras, truncate=truncate), source=path.absolute())

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvdyn_gtsam.capture.assemble import Source, assemble_capture
+from mvdyn_gtsam.capture.focal import camera_with_unknown_focal, first_intrinsics
 from mvdyn_gtsam.capture.images import images_in, natural_key, read_bytes
 from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.capture.streams import ImageStream
@@ -15,8 +16,11 @@ from mvdyn_gtsam.errors import CaptureError
 logger = logging.getLogger(__name__)
 
 INTRINSICS_FILE = "intrinsics.txt"
+ESTIMATE = "estimate"
+"""What that file holds, alone, where the focal length is not known."""
 IMAGE_FOLDERS = (".", "rgb", "color", "images")
 DEFAULT_FPS = 30.0
+_WANTED = f"write fx fy cx cy [k1 k2 p1 p2 [k3]], or only {ESTIMATE} to have the focal length found"
 
 
 def is_folder_per_camera(folder: Path) -> bool:
@@ -33,7 +37,8 @@ def load_folder_per_camera(
 ) -> Capture:
     """Load every camera folder (or those named) below ``folder``::
 
-        scene/cam0/intrinsics.txt     fx fy cx cy [k1 k2 p1 p2 [k3]], px at the size of the images
+        scene/cam0/intrinsics.txt     fx fy cx cy [k1 k2 p1 p2 [k3]], px at the size of the images;
+                                      or only the word "estimate", to have the focal length found
         scene/cam0/*.png              the frames in natural order; or in rgb/, color/, images/
         scene/cam0/groundtruth.txt    optional, TUM lines "timestamp tx ty tz qx qy qz qw" (wTc)
 
@@ -52,7 +57,8 @@ def load_folder_per_camera(
     folders = {path.name: path for path in _camera_folders(folder)}
     if not folders:
         raise CaptureError(
-            f"{folder}: no folder here holds an {INTRINSICS_FILE} (fx fy cx cy); add one per camera"
+            f"{folder}: no folder here holds an {INTRINSICS_FILE} (fx fy cx cy, or {ESTIMATE}); add one per"
+            " camera"
         )
     names = list(cameras) if cameras is not None else list(folders)
     missing = [name for name in names if name not in folders]
@@ -80,22 +86,27 @@ def _source(folder: Path) -> Source:
     if images is None:
         raise CaptureError(f"{folder}: holds no images; put them here or in {folder.name}/rgb")
     stream = ImageStream(images)
+    size = stream.width, stream.height
+    if numbers is None:
+        return Source(camera_with_unknown_focal(Camera(folder.name, *size, *first_intrinsics(*size))), stream)
     fx, fy, cx, cy = numbers[:4]
-    camera = Camera(folder.name, stream.width, stream.height, fx, fy, cx, cy, distortion=numbers[4:])
-    return Source(camera, stream)
+    return Source(Camera(folder.name, *size, fx, fy, cx, cy, distortion=numbers[4:]), stream)
 
 
 def _images(folder: Path) -> list[Path]:
     return images_in(folder) if folder.is_dir() else []
 
 
-def _read_intrinsics(path: Path) -> tuple[float, ...]:
+def _read_intrinsics(path: Path) -> tuple[float, ...] | None:
+    """The numbers of an ``intrinsics.txt``; None where it says that they are to be estimated."""
     text = read_bytes(path).decode("utf-8", errors="replace")
     words = [word for line in text.splitlines() for word in line.split("#")[0].replace(",", " ").split()]
+    if words == [ESTIMATE]:
+        return None
     try:
         numbers = tuple(float(word) for word in words)
     except ValueError as error:
-        raise CaptureError(f"{path}: {error}; write fx fy cx cy [k1 k2 p1 p2 [k3]]") from None
+        raise CaptureError(f"{path}: {error}; {_WANTED}") from None
     if len(numbers) not in (4, 8, 9, 12):
-        raise CaptureError(f"{path}: has {len(numbers)} numbers; write fx fy cx cy [k1 k2 p1 p2 [k3]]")
+        raise CaptureError(f"{path}: has {len(numbers)} numbers; {_WANTED}")
     return numbers

@@ -11,15 +11,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mvdyn_gtsam.capture.assemble import CAMERA_NAME, Source, assemble_capture, open_media, with_media_size
+from mvdyn_gtsam.capture.assemble import CAMERA_NAME, Source, assemble_capture, open_media
+from mvdyn_gtsam.capture.focal import camera_with_unknown_focal, first_intrinsics
 from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.errors import CaptureError
 
 CAPTURE_FILE = "capture.json"
 
 _CAMERA_KEYS = ("name", "source", "width", "height", "fx", "fy", "cx", "cy")
-_OPTIONAL_CAMERA_KEYS = ("distortion", "time_offset")
-_KIND_NAMES = {"str": "text", "list": "list"}
+_OPTIONAL_CAMERA_KEYS = ("distortion", "time_offset", "estimate_focal")
+_KIND_NAMES = {"str": "a text", "list": "a list", "bool": "true or false"}
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 def load_capture(source: Path, *, truncate: bool = False) -> Capture:
     """Load a folder with ``capture.json`` (or that file): streams opened and checked, nothing kept decoded.
 
+    A camera whose ``estimate_focal`` is true has a focal length yet to be found: ``fx`` is its first guess
+    where given, ``cx, cy`` are the centre of the image where not given.
     Keys that only inform ("about", "depth_scale") are accepted; ``num_frames`` is checked where given.
     ``truncate`` accepts cameras of different length, and truncated videos, by cutting all to the shortest.
     Raises CaptureError, naming the file and the fix, on anything missing, undecodable or inconsistent.
@@ -52,7 +55,7 @@ def load_capture(source: Path, *, truncate: bool = False) -> Capture:
 
 def capture_from_cameras(
     videos: Sequence[str | Path],
-    intrinsics: Sequence[Sequence[float]],
+    intrinsics: Sequence[Sequence[float] | None] | None = None,
     *,
     fps: float | None = None,
     distortion: Sequence[Sequence[float]] | None = None,
@@ -62,6 +65,8 @@ def capture_from_cameras(
 ) -> Capture:
     """Capture from one video, or glob of images, per camera and its ``(fx, fy, cx, cy)`` in px.
 
+    None in place of those four numbers, or of all intrinsics, is a focal length yet to be found, of a camera
+    without distortion whose principal point is the centre of the image.
     Cameras are named after their files (``cam0.mp4``: cam0; ``left/*.png``: left), or cam0, cam1, ... where
     those would clash or be no file names. ``fps`` comes from the videos unless given; images need it.
     ``distortion`` (OpenCV order) and ``time_offsets`` (s) are per camera.
@@ -72,20 +77,22 @@ def capture_from_cameras(
     per_camera = {"intrinsics": intrinsics, "distortion": distortion, "time offsets": time_offsets}
     for what, values in per_camera.items():
         if values is not None and len(values) != len(videos):
+            hint = ", or none with --estimate-focal (intrinsics=None) to have the focal lengths found"
             raise CaptureError(
                 f"{len(videos)} cameras but {len(values)} {what}; give one per camera, in order"
+                f"{hint if what == 'intrinsics' else ''}"
             )
     sources = []
     for index, (video, camera_name) in enumerate(zip(videos, _camera_names(videos), strict=True)):
-        values = intrinsics[index]
-        if len(values) != 4:
+        values = None if intrinsics is None else intrinsics[index]
+        if values is not None and len(values) != 4:
             raise CaptureError(f"{video}: intrinsics must be fx,fy,cx,cy: 4 numbers, not {len(values)}")
-        fx, fy, cx, cy = (float(value) for value in values)
         media = open_media(str(video), Path("."), truncate)
+        size = media.width, media.height
+        fx, fy, cx, cy = first_intrinsics(*size) if values is None else (float(value) for value in values)
         camera = Camera(
             camera_name,
-            0,
-            0,
+            *size,
             fx,
             fy,
             cx,
@@ -93,7 +100,7 @@ def capture_from_cameras(
             distortion=tuple(float(value) for value in distortion[index]) if distortion else (),
             time_offset=float(time_offsets[index]) if time_offsets else 0.0,
         )
-        sources.append(Source(with_media_size(camera, media), media))
+        sources.append(Source(camera_with_unknown_focal(camera) if values is None else camera, media))
     if fps is None:
         rates = [source.media.fps for source in sources if source.media.fps is not None]
         if not rates:
@@ -146,15 +153,51 @@ def _camera(entry: object, where: str) -> Camera:
         logger.warning("%s: unknown key %r is ignored", where, key)
     _get(entry, "source", str, where)
     distortion = _get(entry, "distortion", list, where) if entry.get("distortion") is not None else []
-    numbers = {key: _number(entry, key, where) for key in ("fx", "fy", "cx", "cy")}
-    return Camera(
-        name=_get(entry, "name", str, where),
-        width=_integer(entry, "width", where),
-        height=_integer(entry, "height", where),
+    estimate_focal = "estimate_focal" in entry and _get(entry, "estimate_focal", bool, where)
+    width, height = _integer(entry, "width", where), _integer(entry, "height", where)
+    if estimate_focal:
+        fx, fy, cx, cy = _first_intrinsics(entry, width, height, where)
+    else:
+        fx, fy, cx, cy = _intrinsics(entry, where)
+    camera = Camera(
+        _get(entry, "name", str, where),
+        width,
+        height,
+        fx,
+        fy,
+        cx,
+        cy,
         distortion=tuple(_as_number(value, "distortion", where) for value in distortion),
         time_offset=_number(entry, "time_offset", where) if "time_offset" in entry else 0.0,
-        **numbers,
     )
+    return camera_with_unknown_focal(camera, where) if estimate_focal else camera
+
+
+def _intrinsics(entry: Mapping[str, Any], where: str) -> tuple[float, float, float, float]:
+    for key in ("fx", "fy"):
+        if key not in entry:
+            raise CaptureError(
+                f'{where}: the key "{key}" is missing; add it, or "estimate_focal": true to have the focal'
+                " length found"
+            )
+    fx, fy, cx, cy = (_number(entry, key, where) for key in ("fx", "fy", "cx", "cy"))
+    return fx, fy, cx, cy
+
+
+def _first_intrinsics(
+    entry: Mapping[str, Any], width: int, height: int, where: str
+) -> tuple[float, float, float, float]:
+    """Of a camera whose focal length is yet to be found; any of them may be left out."""
+    fx, _, cx, cy = first_intrinsics(width, height)
+    focals = [_number(entry, key, where) for key in ("fx", "fy") if key in entry]
+    if len(set(focals)) > 1:
+        raise CaptureError(
+            f"{where}: fx and fy differ: {focals[0]:g} and {focals[1]:g}, but one focal length will be"
+            " found, of square pixels; give fx alone as its first guess, or neither"
+        )
+    fx = focals[0] if focals else fx
+    cx, cy = (_number(entry, k, where) if k in entry else v for k, v in (("cx", cx), ("cy", cy)))
+    return fx, fx, cx, cy
 
 
 def _get(content: Mapping[str, Any], key: str, kind: type, where: str) -> Any:
@@ -162,7 +205,7 @@ def _get(content: Mapping[str, Any], key: str, kind: type, where: str) -> Any:
         raise CaptureError(f'{where}: the key "{key}" is missing; add it')
     if not isinstance(content[key], kind):
         raise CaptureError(
-            f'{where}: "{key}" must be a {_KIND_NAMES[kind.__name__]}, not {json.dumps(content[key])}'
+            f'{where}: "{key}" must be {_KIND_NAMES[kind.__name__]}, not {json.dumps(content[key])}'
         )
     return content[key]
 

@@ -9,6 +9,10 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+FIRST_FOCAL = 0.75
+"""Focal length that is guessed where none is given, as a share of the longer image side: about that of a
+phone's main camera while it films video."""
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -26,7 +30,8 @@ class Camera:
     time_offset: float = 0.0
     """Seconds to add to this camera's own clock to get the common clock."""
     focal_known: bool = True
-    """Where False, fx and fy are a first guess, and the start finds the focal length in the video."""
+    """Where False, fx and fy are a first guess, equal, and the start finds the focal length in the video;
+    such a camera has no distortion, which could not be taken out of its frames."""
 
     @property
     def intrinsics(self) -> npt.NDArray[np.float64]:

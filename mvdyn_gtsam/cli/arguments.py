@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_capture_arguments(parser: argparse.ArgumentParser) -> None:
-    """CAPTURE, or --camera and --intrinsics in its place."""
+    """CAPTURE, or --camera and --intrinsics in its place, and --estimate-focal."""
     parser.add_argument(
         "capture",
         nargs="?",
@@ -32,11 +32,25 @@ def add_capture_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FX,FY,CX,CY",
-        help="its pinhole intrinsics in px, pixel centres at integers",
+        help="its pinhole intrinsics in px, pixel centres at integers; may be left out of all with"
+        " --estimate-focal",
     )
     group.add_argument("--fps", type=float, help="frame rate, where the files do not say it")
+    add_estimate_focal_argument(parser, "; --resume needs it again")
     parser.add_argument(
         "--truncate", action="store_true", help="accept cameras of different length: cut all to the shortest"
+    )
+
+
+def add_estimate_focal_argument(parser: argparse.ArgumentParser, more: str = "") -> None:
+    """--estimate-focal; ``more`` ends its help."""
+    parser.add_argument(
+        "--estimate-focal",
+        action="store_true",
+        help="the focal lengths are not known: find each camera's in its video, to about half a percent. The"
+        " camera must move from its place (turning is not enough) and have square pixels and no distortion."
+        " Intrinsics that are given are first guesses, and their cx,cy stay. For some cameras only:"
+        f' "estimate_focal": true in capture.json{more}',
     )
 
 
@@ -82,17 +96,28 @@ def read_settings(arguments: argparse.Namespace, *, alone: bool = True) -> dict[
 
 def read_capture(arguments: argparse.Namespace, config: Config) -> Capture:
     """The checked capture the arguments name. Raises CaptureError."""
+    from mvdyn_gtsam.capture import with_unknown_focal
+
+    capture = _open_capture(arguments, config)
+    return with_unknown_focal(capture) if arguments.estimate_focal else capture
+
+
+def _open_capture(arguments: argparse.Namespace, config: Config) -> Capture:
     from mvdyn_gtsam.capture import capture_from_cameras, open_capture
 
     truncate = config.capture.truncate
     if arguments.capture is None and not arguments.camera:
-        raise CaptureError("no input: give a CAPTURE folder, or --camera with --intrinsics for each video")
+        raise CaptureError(
+            "no input: give a CAPTURE folder, or --camera with --intrinsics for each video, or --camera for"
+            " each and --estimate-focal where intrinsics are not known"
+        )
     if arguments.capture is not None:
         if arguments.camera or arguments.intrinsics:
             raise CaptureError(f"{arguments.capture}: give either a CAPTURE folder or --camera, not both")
         return open_capture(arguments.capture, truncate=truncate, fps=arguments.fps)
     intrinsics = [parse_intrinsics(text) for text in arguments.intrinsics]
-    return capture_from_cameras(arguments.camera, intrinsics, fps=arguments.fps, truncate=truncate)
+    given = None if arguments.estimate_focal and not intrinsics else intrinsics
+    return capture_from_cameras(arguments.camera, given, fps=arguments.fps, truncate=truncate)
 
 
 def parse_intrinsics(text: str) -> tuple[float, ...]:

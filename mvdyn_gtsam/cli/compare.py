@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from mvdyn_gtsam.cli.arguments import add_estimate_focal_argument
 from mvdyn_gtsam.errors import BaselineError, CaptureError
 
 SUMMARY = "run COLMAP and GLOMAP on the same frames, add any method's result, one table"
@@ -18,7 +19,11 @@ plots (trajectories.png, error.png) and every method's result. A method that fai
 methods:
   ours                               mvdyn reconstruct, see --stage and --set
   colmap, glomap                     known PINHOLE intrinsics, one camera per device, held fixed; SIFT; frames
-                                     +-10 of the same camera and +-5 of the others are matched; largest model
+                                     +-10 of the same camera and +-5 of the others are matched; largest model.
+                                     Focal lengths that are unknown (--estimate-focal, or so in CAPTURE) start
+                                     from COLMAP's default, not from our guess, and are refined, one per
+                                     device; glomap calibrates its view graph first, and where some are known
+                                     refines those, too, as it can hold all or none; the table says so
   colmap-masks, glomap-masks         the same without features on what moves, see --masks
   colmap-retrieval, glomap-retrieval the same and the frames that look most alike besides, see --descriptor
   colmap-exhaustive, glomap-exhaustive  a control: every frame is matched with every other
@@ -39,6 +44,7 @@ without a pose is left out (npz: NaN) and counted as a failure. PATH/import.json
 EPILOG = """\
 examples:
   mvdyn compare clip --methods ours,colmap,glomap --out comparison
+  mvdyn compare clip --methods ours,colmap,glomap --estimate-focal --out comparison
   mvdyn compare clip --methods ours --method vggt=runs/vggt --method vipe=runs/vipe --out comparison
   mvdyn compare clip --methods "" --method vggt=runs/vggt/poses.npz --out comparison
   mvdyn compare clip --methods glomap,glomap-masks --masks refined_result --out comparison
@@ -67,6 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--groundtruth", type=Path, metavar="DIR", help="default: CAPTURE/groundtruth, where there is one"
     )
     parser.add_argument("--truncate", action="store_true", help="cut all cameras to the shortest")
+    add_estimate_focal_argument(parser)
     parser.add_argument("--timeout", type=float, metavar="SECONDS", help="stop a method after this long")
     ours = parser.add_argument_group("ours")
     ours.add_argument(
@@ -148,6 +155,7 @@ def run(arguments: argparse.Namespace, messages: Console) -> int:
         database=arguments.database,
         share_matches=arguments.share_matches,
         truncate=arguments.truncate,
+        estimate_focal=arguments.estimate_focal,
         timeout_s=arguments.timeout,
         our_arguments=[word for override in arguments.overrides for word in ("--set", override)],
     )

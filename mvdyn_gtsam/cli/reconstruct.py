@@ -44,6 +44,7 @@ examples:
   mvdyn reconstruct clip --out result
   mvdyn reconstruct --camera a.mp4 --intrinsics 800,800,639.5,359.5 \\
                     --camera b.mp4 --intrinsics 810,810,639.5,359.5 --out result
+  mvdyn reconstruct --camera a.mp4 --camera b.mp4 --estimate-focal --out result   # intrinsics not known
   mvdyn reconstruct clip --out result --stage tracking         # poses and rough depth, in half the time
   mvdyn reconstruct clip --out result --resume                # refine it later
   mvdyn reconstruct clip --out result --set tracking.window=20
@@ -171,6 +172,9 @@ def announcement(capture: Capture, out: Path, predicted: bool = False) -> list[s
         f"{capture.name}: {len(capture.cameras)} cameras x {capture.frame_count} frames, {', '.join(sizes)},"
         f" {capture.fps:g} fps; {takes} in {out}"
     ]
+    unknown = [camera.name for camera in capture.cameras if not camera.focal_known]
+    if unknown:
+        lines.append(f"focal length to be found in the video: {', '.join(unknown)}")
     if len(capture.cameras) == 1:
         lines.append("one camera only: its depth rests on its own motion, and what moves is not seen twice")
     parent = next((folder for folder in (out, *out.absolute().parents) if folder.exists()), Path("/"))

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from mvdyn_gtsam.baselines import comparison as comparison_module
 from mvdyn_gtsam.baselines.comparison import compare, our_command
 from mvdyn_gtsam.baselines.process import ProcessUsage
 from mvdyn_gtsam.baselines.results import Comparison, MethodResult
-from mvdyn_gtsam.baselines.settings import BaselineSettings, Request
+from mvdyn_gtsam.baselines.settings import ALL_FOCALS_REFINED, BaselineSettings, Request
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import BaselineError, MvdynError
 from mvdyn_gtsam.evaluation import evaluate
@@ -37,12 +38,14 @@ def truth(tmp_path: Path) -> dict[str, np.ndarray]:
     return poses
 
 
-def write_result(folder: Path, poses: dict[str, np.ndarray]) -> None:
+def write_result(folder: Path, poses: dict[str, np.ndarray], notes: Sequence[str] = ()) -> None:
     cameras = tuple(Camera(name, 8, 6, 5.0, 5.0, 3.5, 2.5) for name in CAMERAS)
     with ReconstructionWriter.create(folder, CaptureInfo("capture", 10.0, FRAMES, cameras), {}) as writer:
         for camera, wTc in poses.items():
             writer.write_trajectory(camera, np.arange(FRAMES) / 10.0, wTc)
         writer.set_groups([list(CAMERAS)])
+        for note in notes:
+            writer.add_note(note)
 
 
 def usage(problem: str | None = None) -> ProcessUsage:
@@ -111,6 +114,47 @@ def test_the_tables_say_what_failed_and_what_is_incomplete(finished: tuple[Path,
     shown = capture.get()
     assert "…" not in shown
     assert "colmap (failed)" in shown and "glomap: incomplete" in shown and "640" in shown
+
+
+def test_the_tables_say_that_known_focal_lengths_were_refined(
+    truth: dict[str, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worker(request: Request, *_: object) -> ProcessUsage:
+        write_result(request.out, truth, [ALL_FOCALS_REFINED] if request.method == "glomap" else ["another"])
+        return usage()
+
+    monkeypatch.setattr(comparison_module, "run_worker", worker)
+    compare(tmp_path / "capture", None, ["colmap", "glomap"], tmp_path / "out")
+    text = (tmp_path / "out" / "compare.md").read_text()
+    assert text.splitlines()[-1] == f"* glomap: {ALL_FOCALS_REFINED}"
+    assert "another" not in text
+
+
+def test_estimate_focal_reaches_every_method_and_needs_cameras_without_distortion(
+    clip: tuple[Path, dict[str, np.ndarray]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = clip[0]
+    asked: list[bool] = []
+
+    def ours(_: Path, folder: Path, stage: str, arguments: list[str], *__: object) -> ProcessUsage:
+        asked.append(arguments == ["--set", "a=1", "--estimate-focal"])
+        return usage("no pose (exit code 1)")
+
+    def worker(request: Request, *_: object) -> ProcessUsage:
+        asked.append(request.estimate_focal)
+        return usage("no model (exit code 1)")
+
+    monkeypatch.setattr(comparison_module, "_run_ours", ours)
+    monkeypatch.setattr(comparison_module, "run_worker", worker)
+    words = ["--set", "a=1"]
+    compare(capture, None, ["ours", "glomap"], tmp_path / "out", our_arguments=words, estimate_focal=True)
+    assert asked == [True, True]
+    content = json.loads((capture / "capture.json").read_text())
+    content["cameras"][1]["distortion"] = [0.1, 0, 0, 0, 0]
+    (capture / "capture.json").write_text(json.dumps(content))
+    with pytest.raises(MvdynError, match="camera cam1: has distortion"):
+        compare(capture, None, ["ours"], tmp_path / "other", estimate_focal=True)
+    assert not (tmp_path / "other").exists() and len(asked) == 2
 
 
 def test_without_ground_truth_registration_is_still_compared(

@@ -10,12 +10,12 @@ import pytest
 
 from mvdyn_gtsam.baselines import BaselineSettings, run_baseline, runner
 from mvdyn_gtsam.baselines.process import ProcessUsage
-from mvdyn_gtsam.baselines.settings import Request
+from mvdyn_gtsam.baselines.settings import ALL_FOCALS_REFINED, Request
 from mvdyn_gtsam.baselines.shared import SharedCost
 from mvdyn_gtsam.errors import BaselineError
 from mvdyn_gtsam.evaluation import evaluate
 from mvdyn_gtsam.reconstruction import Reconstruction
-from tests.baselines.scenes import HEIGHT, WIDTH, write_capture
+from tests.baselines.scenes import FOCAL, HEIGHT, WIDTH, write_capture
 from tests.baselines.test_retrieval import write_model
 
 SETTINGS = BaselineSettings(num_threads=1)
@@ -62,6 +62,31 @@ def test_both_methods_place_the_cameras_of_a_tiny_scene(tmp_path: Path) -> None:
     )
     assert other.phases["matching"] != first.phases["matching"]  # of other settings, never shared
     assert len(list(matches.iterdir())) == 2
+
+
+@pytest.mark.slow
+def test_a_focal_length_that_is_not_known_is_found(tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
+    write_capture(capture, frames=6)
+    content = json.loads((capture / "capture.json").read_text())
+    content["cameras"][0].update(fx=100.0, fy=100.0, estimate_focal=True)
+    (capture / "capture.json").write_text(json.dumps(content))
+    for method in ("glomap", "colmap"):
+        out = tmp_path / method
+        result = run_baseline(capture, method, out, settings=SETTINGS, database=tmp_path / "matches")
+        assert result.registered == 1.0
+        reconstruction = Reconstruction.load(out)
+        unknown, known = (reconstruction.camera(name) for name in ("cam0", "cam1"))
+        assert unknown.fx == unknown.fy == pytest.approx(FOCAL, rel=0.01) and not unknown.focal_known
+        assert known.fx == pytest.approx(FOCAL, rel=0.01)
+        assert (known.fx == FOCAL) == (method == "colmap")
+        assert (ALL_FOCALS_REFINED in reconstruction.manifest["notes"]) == (method == "glomap")
+        assert evaluate(reconstruction, capture / "groundtruth").ate_m < 0.02
+    run_baseline(capture, "glomap", tmp_path / "none", settings=SETTINGS, estimate_focal=True)
+    reconstruction = Reconstruction.load(tmp_path / "none")
+    assert not any(reconstruction.camera(name).focal_known for name in reconstruction.cameras)
+    assert reconstruction.camera("cam1").fx == pytest.approx(FOCAL, rel=0.01)
+    assert reconstruction.manifest["notes"] == []
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ def test_a_request_survives_the_way_to_the_worker() -> None:
     )
     request = Request(Path("capture"), "glomap", Path("out"), settings, database=Path("db"), truncate=True)
     assert Request.from_json(request.to_json()) == request
+    unknown = replace(request, truncate=False, estimate_focal=True)
+    assert Request.from_json(unknown.to_json()) == unknown
 
 
 def test_an_unknown_method_is_refused() -> None:

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,8 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvdyn_gtsam.baselines import sfm
-from mvdyn_gtsam.baselines.settings import BaselineSettings
-from mvdyn_gtsam.capture import load_capture
+from mvdyn_gtsam.baselines.settings import BaselineSettings, Method
+from mvdyn_gtsam.capture import Camera, load_capture
 from mvdyn_gtsam.errors import BaselineError, CaptureError
 from tests.baselines.scenes import CX, CY, FOCAL, HEIGHT, WIDTH, write_capture
 
@@ -129,6 +131,93 @@ def test_the_database_holds_one_pinhole_camera_per_device_at_colmaps_pixel_centr
     for params, prior in cameras:
         np.testing.assert_allclose(np.frombuffer(params), [FOCAL, FOCAL, CX + 0.5, CY + 0.5])
         assert prior == 1
+
+
+def _unknown_and_known(folder: Path) -> tuple[Camera, ...]:
+    """The cameras of a capture of one frame, the first of unknown focal length, written with its frames."""
+    write_capture(folder / "capture", frames=1)
+    capture = load_capture(folder / "capture")
+    sfm.write_frames(capture, folder / "images")
+    first, second = capture.cameras
+    unknown = replace(first, fx=150.0, fy=150.0, cx=CX + 1.0, cy=CY - 2.0, focal_known=False)
+    return unknown, second
+
+
+def test_a_guessed_focal_length_is_not_given_and_what_is_known_is(tmp_path: Path) -> None:
+    cameras, database = _unknown_and_known(tmp_path), tmp_path / "a.db"
+    sfm.extract_features(cameras, 1, tmp_path / "images", database, BaselineSettings(num_threads=1))
+    with sqlite3.connect(database) as connection:
+        stored = connection.execute(
+            "SELECT images.name, model, params, prior_focal_length FROM cameras JOIN images USING (camera_id)"
+        ).fetchall()
+    (_, model, unknown, prior), (_, known_model, known, known_prior) = sorted(stored)
+    assert (prior, known_prior) == (0, 1)
+    assert model != known_model
+    # 1.2 times the longer side is COLMAP's default.
+    np.testing.assert_allclose(np.frombuffer(unknown), [1.2 * WIDTH, CX + 1.5, CY - 1.5])
+    np.testing.assert_allclose(np.frombuffer(known), [FOCAL, FOCAL, CX + 0.5, CY + 0.5])
+
+
+def test_focal_lengths_that_are_unknown_are_refined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras, database = _unknown_and_known(tmp_path), tmp_path / "a.db"
+    sfm.extract_features(cameras, 1, tmp_path / "images", database, BaselineSettings(num_threads=1))
+    calls: list[tuple[str, Any]] = []
+    found = SimpleNamespace(num_reg_images=lambda: 1)
+
+    def called(name: str, result: Any) -> Any:
+        def call(*arguments: Any, **options: Any) -> Any:
+            calls.append((name, options.get("options")))
+            return result
+
+        return call
+
+    monkeypatch.setattr("pycolmap.incremental_mapping", called("colmap", {0: found}))
+    monkeypatch.setattr("pycolmap.global_mapping", called("glomap", {0: found}))
+    monkeypatch.setattr("pycolmap.calibrate_view_graph", called("view graph", True))
+
+    def run(method: Method, *which: Camera) -> list[tuple[str, Any]]:
+        calls.clear()
+        sfm.reconstruct(method, tmp_path, database, tmp_path / "sparse", BaselineSettings(), which)
+        return list(calls)
+
+    with sqlite3.connect(database) as connection:
+        (known_id,) = connection.execute("SELECT camera_id FROM images WHERE name LIKE 'cam1/%'").fetchone()
+    ((_, options),) = run("colmap", *cameras)
+    assert options.ba_refine_focal_length and options.mapper.abs_pose_refine_focal_length
+    assert not (options.ba_refine_principal_point or options.ba_refine_extra_params)
+    assert options.constant_cameras == {known_id}
+    (calibration, _), (_, options) = run("glomap", *cameras)
+    assert calibration == "view graph"
+    adjustment = options.mapper.bundle_adjustment
+    assert adjustment.refine_focal_length
+    assert not (adjustment.refine_principal_point or adjustment.refine_extra_params)
+    ((_, options),) = run("colmap", cameras[1])
+    assert options.summary() == sfm._incremental_options(BaselineSettings()).summary()
+    ((name, options),) = run("glomap", cameras[1])
+    assert name == "glomap"
+    assert options.summary() == sfm._global_options(BaselineSettings()).summary()
+    monkeypatch.setattr("pycolmap.calibrate_view_graph", lambda *_: False)
+    with pytest.raises(BaselineError, match="glomap found no focal lengths"):
+        run("glomap", *cameras)
+
+
+def test_cameras_get_the_focal_lengths_of_the_model() -> None:
+    guess = Camera("a", 8, 6, 5.0, 5.0, 3.5, 2.5, focal_known=False)
+    known = replace(guess, name="b", fx=7.0, fy=7.5, focal_known=True)
+    lost = replace(guess, name="c")
+    model = SimpleNamespace(
+        images={
+            1: SimpleNamespace(name="b/000000.png", camera_id=4),
+            2: SimpleNamespace(name="a/000001.png", camera_id=3),
+        },
+        cameras={
+            3: SimpleNamespace(focal_length_x=6.0, focal_length_y=6.0),
+            4: SimpleNamespace(focal_length_x=7.1, focal_length_y=7.6),
+        },
+    )
+    expected = (replace(guess, fx=6.0, fy=6.0), replace(known, fx=7.1, fy=7.6), lost)
+    assert sfm.read_cameras(model, (guess, known, lost)) == expected
+    assert sfm.read_cameras(model, (known,)) == (known,)
 
 
 def _keypoints(database: Path) -> np.ndarray:

@@ -32,6 +32,7 @@ def test_both_mappers_share_and_nothing_else_does(tmp_path: Path) -> None:
         folder(request(inter_window=4)),
         folder(request(), replace(INFO, frame_count=4)),
         folder(request(), replace(INFO, cameras=(camera,))),
+        folder(request(), replace(INFO, cameras=(replace(INFO.cameras[0], focal_known=False),))),
         folder(request(), replace(INFO, first_frame_crc32=(18,))),
         folder(request(), version="4.3"),
         folder(replace(request(), capture=Path("other"))),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,14 @@ def test_written_captures_show_the_same_frames(capture: Capture, tmp_path: Path)
     rows = np.loadtxt(tmp_path / "out" / "groundtruth" / "cam1.txt")
     np.testing.assert_allclose(rows[:, 0], again.timestamps, atol=1e-8)
     np.testing.assert_allclose(rows[:, 1:], np.c_[np.arange(4), np.zeros((4, 5)), np.ones(4)])
+
+
+def test_an_unknown_focal_length_stays_unknown(capture: Capture, tmp_path: Path) -> None:
+    cameras = (replace(capture.cameras[0], focal_known=False), capture.cameras[1])
+    write_capture(replace(capture, cameras=cameras), tmp_path / "out")
+    again = load_capture(tmp_path / "out")
+    assert again.cameras[0] == cameras[0]
+    assert again.cameras[1].focal_known
 
 
 def test_nothing_is_overwritten(capture: Capture, tmp_path: Path) -> None:

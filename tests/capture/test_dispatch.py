@@ -44,7 +44,9 @@ def test_single_files_and_missing_paths_are_named(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="nowhere: there is no such file or folder"):
         open_capture(tmp_path / "nowhere")
     video = write_video(tmp_path / "cam0.mp4", 3)
-    with pytest.raises(CaptureError, match="is a single file; give each video with --camera"):
+    with pytest.raises(
+        CaptureError, match="is a single file; give each video with --camera.* --estimate-focal"
+    ):
         open_capture(video)
 
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from mvdyn_gtsam.capture import load_folder_per_camera
+from mvdyn_gtsam.capture import FIRST_FOCAL, Camera, load_folder_per_camera
 from mvdyn_gtsam.errors import CaptureError
-from tests.capture.media import frame_number, write_images
+from tests.capture.media import HEIGHT, WIDTH, frame_number, write_images
 
 
 def write_camera(
@@ -36,11 +36,21 @@ def test_stated_rate_and_chosen_cameras(tmp_path: Path) -> None:
     assert capture.fps == 15.0 and [camera.name for camera in capture.cameras] == ["c", "a"]
 
 
+def test_one_word_leaves_the_focal_length_to_find(tmp_path: Path) -> None:
+    write_camera(tmp_path / "cam0")
+    write_camera(tmp_path / "cam1", intrinsics="# a phone\nestimate\n")
+    known, unknown = load_folder_per_camera(tmp_path).cameras
+    focal = FIRST_FOCAL * WIDTH
+    assert known.focal_known
+    assert unknown == Camera("cam1", WIDTH, HEIGHT, focal, focal, 31.5, 23.5, focal_known=False)
+
+
 @pytest.mark.parametrize(
     ("intrinsics", "message"),
     [
         ("60 60 31.5", r"cam0/intrinsics\.txt: has 3 numbers"),
-        ("60 60 31.5 23.5 0.1", "has 5 numbers"),
+        ("60 60 31.5 23.5 0.1", "has 5 numbers.*or only estimate to have the focal length found"),
+        ("estimate 60", "could not convert.*or only estimate"),
         ("fx=60 60 31.5 23.5", r"intrinsics\.txt: could not convert"),
         ("", r"intrinsics\.txt: the file is empty"),
         ("60 60 nan 23.5", "must be finite"),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mvdyn_gtsam.capture import Capture, capture_from_cameras, load_capture
+from mvdyn_gtsam.capture import FIRST_FOCAL, Camera, Capture, capture_from_cameras, load_capture
 from mvdyn_gtsam.errors import CaptureError
 from tests.capture.media import (
     HEIGHT,
@@ -115,6 +115,20 @@ def test_one_camera_works_with_a_note(two_videos: Path, caplog: pytest.LogCaptur
         ({"source": "cam9.mp4"}, "cam9.mp4: there is no such file"),
         ({"source": "cam1/*.png"}, "cam1/*.png: no file matches this pattern"),
         ({"source": "."}, "is a folder"),
+        ({"estimate_focal": 1}, 'cameras[1]: "estimate_focal" must be true or false, not 1'),
+        ({"estimate_focal": None}, '"estimate_focal" must be true or false, not null'),
+        ({"estimate_focl": True}, "did you mean 'estimate_focal'?"),
+        ({"estimate_focal": True, "fy": 61}, "cameras[1]: fx and fy differ: 60 and 61"),
+        ({"estimate_focal": True, "fx": -60, "fy": -60}, "must be positive"),
+        ({"estimate_focal": True, "cx": 64.0}, "the principal point (64, 23.5) is outside"),
+        (
+            {"estimate_focal": True, "distortion": [0, 0, 0.1, 0, 0]},
+            "capture.json: cameras[1]: has distortion",
+        ),
+        (
+            {"estimate_focal": True, "width": 128, "height": 96},
+            "cam1.mp4: frames are 64x48, but camera cam1 is said to have 128x96; correct its width",
+        ),
         ({"time_offset": 100.0}, "no instant is seen by every camera (cam1 starts last"),
     ],
 )
@@ -128,6 +142,35 @@ def test_missing_camera_keys_are_named(two_videos: Path, key: str) -> None:
     del cameras[1][key]
     message = _refused(write_capture_json(two_videos, *cameras))
     assert f'cameras[1]: the key "{key}" is missing' in message and "capture.json" in message
+    hint = 'add it, or "estimate_focal": true to have the focal length found'
+    assert (hint in message) == (key in ("fx", "fy"))
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, (64 * FIRST_FOCAL, 64 * FIRST_FOCAL, 31.5, 23.5)),
+        ({"fx": 70}, (70, 70, 31.5, 23.5)),
+        ({"fy": 70, "cy": 20}, (70, 70, 31.5, 20)),
+        ({"fx": 70, "fy": 70.0, "cx": 30, "cy": 20}, (70, 70, 30, 20)),
+        ({"distortion": [0, 0, 0, 0, 0]}, (64 * FIRST_FOCAL, 64 * FIRST_FOCAL, 31.5, 23.5)),
+    ],
+)
+def test_a_focal_length_may_be_left_to_find(
+    two_videos: Path, given: dict[str, Any], expected: tuple[float, float, float, float]
+) -> None:
+    known, entry = _two()
+    for key in ("fx", "fy", "cx", "cy"):
+        del entry[key]
+    write_capture_json(two_videos, known, entry | given | {"estimate_focal": True})
+    cameras = load_capture(two_videos).cameras
+    assert cameras[1] == Camera("cam1", WIDTH, HEIGHT, *expected, focal_known=False)
+    assert cameras[0].focal_known
+
+
+def test_estimate_focal_may_be_false(two_videos: Path) -> None:
+    known = load_capture(write_capture_json(two_videos, *_two())).cameras
+    assert load_capture(write_capture_json(two_videos, *_two(estimate_focal=False))).cameras == known
 
 
 @pytest.mark.parametrize(
@@ -272,6 +315,22 @@ def test_cameras_from_the_command_line(two_videos: Path) -> None:
     assert _numbers(capture, 1) == list(range(10))
 
 
+def test_cameras_without_intrinsics_have_a_focal_length_to_find(two_videos: Path) -> None:
+    videos = [two_videos / "cam0.mp4", two_videos / "cam1.mp4"]
+    guess = (64 * FIRST_FOCAL, 64 * FIRST_FOCAL, 31.5, 23.5)
+    unknown = [Camera(f"cam{index}", WIDTH, HEIGHT, *guess, focal_known=False) for index in (0, 1)]
+    capture = capture_from_cameras(videos)
+    assert list(capture.cameras) == unknown
+    assert _numbers(capture, 1) == list(range(10))
+    given = Camera("cam0", WIDTH, HEIGHT, *INTRINSICS)
+    assert list(capture_from_cameras(videos, [INTRINSICS, None]).cameras) == [given, unknown[1]]
+    distortion = [(0.1, 0, 0, 0, 0), (0, 0, 0, 0, 0)]
+    mixed = capture_from_cameras(videos, [INTRINSICS, None], distortion=distortion)
+    assert mixed.cameras[0].distortion == distortion[0] and mixed.cameras[1].distortion == ()
+    with pytest.raises(CaptureError, match="camera cam0: has distortion"):
+        capture_from_cameras(videos, distortion=distortion)
+
+
 def test_command_line_patterns_are_named_after_folders(tmp_path: Path) -> None:
     for name in ("left", "right"):
         write_images(tmp_path / name, range(4))
@@ -294,7 +353,8 @@ def test_command_line_mistakes_are_refused(two_videos: Path) -> None:
     videos = [two_videos / "cam0.mp4", two_videos / "cam1.mp4"]
     cases: list[tuple[dict[str, Any], str]] = [
         ({"videos": [], "intrinsics": []}, "no cameras given"),
-        ({"videos": videos, "intrinsics": [INTRINSICS]}, "2 cameras but 1 intrinsics"),
+        ({"videos": videos, "intrinsics": [INTRINSICS]}, "2 cameras but 1 intrinsics; give one per camera"),
+        ({"videos": videos, "intrinsics": []}, "or none with --estimate-focal (intrinsics=None)"),
         ({"videos": videos, "intrinsics": [INTRINSICS, INTRINSICS[:3]]}, "fx,fy,cx,cy: 4 numbers, not 3"),
         ({"videos": videos, "intrinsics": [INTRINSICS] * 2, "time_offsets": [0.0]}, "1 time offsets"),
         ({"videos": [two_videos / "x.mp4"], "intrinsics": [INTRINSICS]}, "x.mp4: there is no such file"),

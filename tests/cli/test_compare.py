@@ -105,11 +105,12 @@ def test_compare_passes_everything_on(
         "refinement",
     ]
     words += ["--masks", "m", "--descriptor", "d.onnx", "--retrieval-pairs", "9", "--database", "db"]
+    words += ["--estimate-focal"]
     code, _, err = run(capsys, "compare", demo_capture(), "--out", tmp_path, *words)
     assert code == 0, err
     assert asked["methods"] == ["ours", "glomap-masks", "glomap-retrieval"]
     assert asked["imported"] == {"vggt": Path("runs/a=b")}
-    assert asked["stage"] == "refinement" and asked["database"] == Path("db")
+    assert asked["stage"] == "refinement" and asked["database"] == Path("db") and asked["estimate_focal"]
     assert asked["settings"] == baselines.BaselineSettings(
         masks=Path("m"), descriptor=Path("d.onnx"), retrieval_pairs=9
     )
@@ -119,7 +120,16 @@ def test_the_help_names_every_method_and_layout(capsys: pytest.CaptureFixture[st
     text = run(capsys, "compare", "--help")[1]
     words = set(re.findall(r"[\w./<>-]+", text))
     assert {*baselines.BASELINES, "ours"} <= words
-    for wanted in ("TUM", "COLMAP model", "transforms.json", ".npz", "OpenGL", "import.json", "depth_scale"):
+    for wanted in (
+        "TUM",
+        "COLMAP model",
+        "transforms.json",
+        ".npz",
+        "OpenGL",
+        "import.json",
+        "depth_scale",
+        "estimate",
+    ):
         assert wanted in text
     assert "compare --help" in run(capsys, "evaluate", "--help")[1]
 

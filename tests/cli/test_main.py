@@ -189,6 +189,7 @@ def test_no_verb_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["missing", "--out", "{tmp}/o"], "missing: there is no such file or folder"),
         (["--out", "{tmp}/o"], "no input: give a CAPTURE folder"),
+        (["--out", "{tmp}/o", "--estimate-focal"], "and --estimate-focal where intrinsics are not known"),
         (["{demo}", "--out", "{tmp}/o", "--set", "tracking.windw=3"], "did you mean tracking.window?"),
         (["{demo}", "--out", "{tmp}/o", "--config", "none.toml"], "none.toml: cannot be read"),
         (["{demo}", "--out", "{tmp}"], "not empty and not a reconstruction"),
@@ -197,7 +198,16 @@ def test_no_verb_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
             ["--camera", "a.mp4", "--intrinsics", "1,2,3", "--out", "{tmp}/o"],
             "--intrinsics 1,2,3: write four",
         ),
-        (["--camera", "a.mp4", "--out", "{tmp}/o"], "1 cameras but 0 intrinsics"),
+        (["--camera", "a.mp4", "--out", "{tmp}/o"], "1 cameras but 0 intrinsics; give one per camera"),
+        (["--camera", "a.mp4", "--out", "{tmp}/o"], "or none with --estimate-focal"),
+        (["--camera", "a.mp4", "--estimate-focal", "--out", "{tmp}/o"], "a.mp4: there is no such file"),
+        (
+            [
+                *("--camera", "a.mp4", "--camera", "b.mp4", "--intrinsics", "1,1,1,1"),
+                *("--estimate-focal", "--out", "{tmp}/o"),
+            ],
+            "2 cameras but 1 intrinsics",
+        ),
         (["--camera", "a.mp4", "--intrinsics", "1,1,1,1", "--out", "{tmp}/o"], "a.mp4"),
         (
             ["{demo}", "--out", "{tmp}/o", "--depth-prior", "{tmp}/none"],
@@ -318,6 +328,42 @@ def test_reconstruct_from_videos(
     result = Reconstruction.load(tmp_path / "o")
     assert result.cameras == ["cam0", "cam1"]
     np.testing.assert_array_equal(result.intrinsics("cam1"), [[396, 0, 255.5], [0, 395, 191.5], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["{demo}"], (396.0, 255.5, 191.5)),
+        (["--camera", "{demo}/cam0.mp4", "--camera", "{demo}/cam1.mp4"], (0.75 * 512, 255.5, 191.5)),
+        (
+            [*("--camera", "{demo}/cam0.mp4", "--intrinsics", "396,395,250,190"),
+             *("--camera", "{demo}/cam1.mp4", "--intrinsics", "396,395,250,190")],
+            (396.0, 250.0, 190.0),
+        ),
+    ],
+)  # fmt: skip
+def test_focal_lengths_may_be_left_to_find(
+    words: list[str],
+    expected: tuple[float, float, float],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    use_pipeline: Callable[[Pipeline], None],
+) -> None:
+    taken: list[Capture] = []
+
+    def pipeline(capture: Capture, *arguments: Any, **options: Any) -> Reconstruction:
+        taken.append(capture)
+        return oracle(capture, *arguments, **options)
+
+    use_pipeline(pipeline)
+    filled = [word.format(demo=demo_capture()) for word in words]
+    code, _, err = run(capsys, "reconstruct", *filled, "--out", tmp_path / "o", "--estimate-focal")
+    assert code == 0 and "focal length to be found in the video: cam0, cam1" in err, err
+    for camera in taken[0].cameras:
+        assert not camera.focal_known and camera.fx == camera.fy
+        assert (camera.fx, camera.cx, camera.cy) == pytest.approx(expected, abs=1.5)
+    assert run(capsys, "reconstruct", demo_capture(), "--out", tmp_path / "known")[0] == 0
+    assert all(camera.focal_known for camera in taken[1].cameras)
 
 
 def test_a_failing_run_keeps_what_it_has(
