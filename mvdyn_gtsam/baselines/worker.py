@@ -19,11 +19,9 @@ from mvdyn_gtsam.baselines.retrieval import describe_images, retrieved_pairs
 from mvdyn_gtsam.baselines.settings import ALL_FOCALS_REFINED, RESULT_NAME, Request
 from mvdyn_gtsam.baselines.shared import Phases, SharedCost, shared_folder
 from mvdyn_gtsam.capture import open_capture, with_unknown_focal
-from mvdyn_gtsam.capture.model import Camera, Capture
+from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.errors import BaselineError, MvdynError
 from mvdyn_gtsam.reconstruction import CaptureInfo, ReconstructionWriter
-from mvdyn_gtsam.reconstruction.files import write_json
-from mvdyn_gtsam.reconstruction.manifest import MANIFEST_NAME, read_manifest
 
 
 def run(request: Request) -> None:
@@ -42,18 +40,13 @@ def run(request: Request) -> None:
         work = shared_folder(request.database, request, info, version("pycolmap"))
     with ReconstructionWriter.create(request.out, info, config, overwrite=True) as writer:
         try:
-            cameras = _reconstruct(request, capture, work, writer)
+            _reconstruct(request, capture, work, writer)
         finally:
             if request.database is None:
                 shutil.rmtree(work, ignore_errors=True)
-    if cameras != capture.cameras:
-        _write_focal_lengths(request.out, cameras)
 
 
-def _reconstruct(
-    request: Request, capture: Capture, work: Path, writer: ReconstructionWriter
-) -> tuple[Camera, ...]:
-    """Do it all, and return the cameras, with the focal lengths that were found."""
+def _reconstruct(request: Request, capture: Capture, work: Path, writer: ReconstructionWriter) -> None:
     phases = Phases()
     reused = _match(request, capture, work, phases)
     # Before mapping: a method that fails there took these phases over all the same.
@@ -83,7 +76,8 @@ def _reconstruct(
     known = [camera.focal_known for camera in capture.cameras]
     if request.method == "glomap" and any(known) and not all(known):
         writer.add_note(ALL_FOCALS_REFINED)
-    return sfm.read_cameras(model, capture.cameras)
+    refined = zip(capture.cameras, sfm.read_cameras(model, capture.cameras), strict=True)
+    writer.set_focal_lengths({now.name: (now.fx, None) for before, now in refined if now != before})
 
 
 def _match(request: Request, capture: Capture, work: Path, phases: Phases) -> SharedCost:
@@ -126,14 +120,6 @@ def _retrieve(
 def _write_result(request: Request, phases: dict[str, float], reused: SharedCost, points: int | None) -> None:
     result = {"phases": phases, "reused": reused.to_json(), "points": points}
     (request.out / RESULT_NAME).write_text(json.dumps(result, indent=1))
-
-
-def _write_focal_lengths(folder: Path, cameras: tuple[Camera, ...]) -> None:
-    """Put them in the place of the first guesses, which readers of the result would take for found."""
-    manifest = read_manifest(folder)
-    for entry, camera in zip(manifest["capture"]["cameras"], cameras, strict=True):
-        entry.update(fx=camera.fx, fy=camera.fy)
-    write_json(folder / MANIFEST_NAME, manifest)
 
 
 def _write(

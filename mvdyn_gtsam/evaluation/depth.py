@@ -218,11 +218,17 @@ def _add_frame(
     moves = _moving_pixels(groundtruth, match.camera, time, valid)
     _add_relative_errors(total, g, e, moves)
     if row >= 0 and match.has_estimate[row]:
-        intrinsics = reconstruction.intrinsics(match.camera)
+        own = reconstruction.intrinsics(match.camera)
+        # an error of the focal length is one of the points
+        true = groundtruth.intrinsics.get(match.camera, own)
         step = max(1, -(-len(g) // budget))
         pixels = np.argwhere(valid)[::step, ::-1].astype(np.float64)
         world, camera = _point_distances(
-            pixels, g[::step], e[::step], intrinsics, match.truth[row], match.estimated[row], gSe
+            backproject(pixels, g[::step], true),
+            backproject(pixels, e[::step], own),
+            match.truth[row],
+            match.estimated[row],
+            gSe,
         )
         total.world_distances.append(world)
         total.camera_distances.append(camera)
@@ -262,11 +268,10 @@ def _add_relative_errors(
 
 
 def _point_distances(
-    pixels: Array, g: Array, e: Array, intrinsics: Array, gTc: Array, eTc: Array, gSe: Similarity
+    true_points: Array, estimated_points: Array, gTc: Array, eTc: Array, gSe: Similarity
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Distances ``(N,)`` in the world after the Sim(3), and in the camera's frame after the scale alone."""
-    true_points = backproject(pixels, g, intrinsics)
-    estimated_points = backproject(pixels, e, intrinsics)
+    """Distances ``(N,)`` in the world after the Sim(3), and in the camera's frame after the scale alone, of
+    points ``(N, 3)`` of the cameras."""
     world = transform_points(gTc, true_points) - gSe.transform_points(transform_points(eTc, estimated_points))
     camera = true_points - gSe.scale * estimated_points
     return (

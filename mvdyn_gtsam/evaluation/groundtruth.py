@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ class GroundTruth:
     trajectories: Mapping[str, tuple[Array, Array]]
     """Camera name -> (timestamps ``(T,)`` seconds, ``wTc`` ``(T, 4, 4)`` metres)."""
     depth_scale: float = DEFAULT_DEPTH_SCALE
+    intrinsics: Mapping[str, Array] = field(default_factory=dict)
+    """``(3, 3)`` px, of the cameras for which ``capture.json`` beside the folder states them."""
 
     @property
     def cameras(self) -> list[str]:
@@ -73,8 +75,8 @@ class GroundTruth:
 def load_groundtruth(folder: str | Path, depth_scale: float | None = None) -> GroundTruth:
     """Read ``<camera>.txt`` TUM files of a ``groundtruth`` folder; images stay on disk.
 
-    ``depth_scale`` (metres per unit) is that of ``capture.json`` next to the folder unless given.
-    Raises EvaluationError when there is no trajectory or one cannot be read.
+    ``depth_scale`` (metres per unit) is that of ``capture.json`` next to the folder unless given; intrinsics
+    are its, too. Raises EvaluationError when there is no trajectory or one cannot be read.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -83,9 +85,10 @@ def load_groundtruth(folder: str | Path, depth_scale: float | None = None) -> Gr
     if not paths:
         raise EvaluationError(f"{folder}: holds no <camera>.txt trajectory")
     trajectories = {path.stem: read_tum(path) for path in paths}
+    capture = _read_capture(folder.parent / "capture.json")
     if depth_scale is None:
-        depth_scale = _depth_scale_of(folder.parent / "capture.json")
-    return GroundTruth(folder, trajectories, depth_scale)
+        depth_scale = _depth_scale_of(capture, folder.parent / "capture.json")
+    return GroundTruth(folder, trajectories, depth_scale, _intrinsics_of(capture))
 
 
 def read_tum(path: Path) -> tuple[Array, Array]:
@@ -125,16 +128,37 @@ def read_tum(path: Path) -> tuple[Array, Array]:
     return values[:, 0], wTc
 
 
-def _depth_scale_of(capture_json: Path) -> float:
+def _read_capture(capture_json: Path) -> Mapping[str, Any]:
+    """What ``capture.json`` holds; nothing where there is none."""
     if not capture_json.is_file():
-        return DEFAULT_DEPTH_SCALE
+        return {}
     try:
-        content: dict[str, Any] = json.loads(capture_json.read_text())
-        scale = float(content.get("depth_scale", DEFAULT_DEPTH_SCALE))
-    except (OSError, ValueError, AttributeError, TypeError) as error:
+        content = json.loads(capture_json.read_text())
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"{capture_json}: depth_scale cannot be read ({error})") from error
+    if not isinstance(content, dict):
+        raise EvaluationError(f"{capture_json}: depth_scale cannot be read (no object)")
+    return content
+
+
+def _depth_scale_of(capture: Mapping[str, Any], capture_json: Path) -> float:
+    try:
+        scale = float(capture.get("depth_scale", DEFAULT_DEPTH_SCALE))
+    except (ValueError, TypeError) as error:
         raise EvaluationError(f"{capture_json}: depth_scale cannot be read ({error})") from error
     if not (np.isfinite(scale) and scale > 0):
         raise EvaluationError(
             f"{capture_json}: depth_scale is {scale}; it must be a positive number of metres"
         )
     return scale
+
+
+def _intrinsics_of(capture: Mapping[str, Any]) -> dict[str, Array]:
+    """Of the cameras that state them; first guesses are none."""
+    found = {}
+    for camera in capture.get("cameras", ()):
+        numbers = [camera.get(key) for key in ("fx", "fy", "cx", "cy")]
+        if not camera.get("estimate_focal") and all(isinstance(number, int | float) for number in numbers):
+            fx, fy, cx, cy = (float(number) for number in numbers)
+            found[str(camera.get("name"))] = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return found

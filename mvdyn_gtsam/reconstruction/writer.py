@@ -247,8 +247,8 @@ class ReconstructionWriter:
         self._manifest["groups"] = [list(group) for group in groups]
         self._write_manifest()
 
-    def set_focal_lengths(self, found: Mapping[str, tuple[float, float]]) -> None:
-        """Set the focal lengths that were found, by camera, and their standard deviations, px."""
+    def set_focal_lengths(self, found: Mapping[str, tuple[float, float | None]]) -> None:
+        """Set the focal lengths that were found, by camera, and their standard deviations where known, px."""
         for camera in found:
             self._check_camera(camera)
         self._manifest["focal_lengths"] = {

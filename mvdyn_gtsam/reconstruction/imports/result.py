@@ -45,8 +45,17 @@ class ImportedResult:
         return self.capture.timestamps, self.poses[camera]
 
     def intrinsics(self, camera: str) -> npt.NDArray[np.float64]:
-        """``(3, 3)`` at the input resolution: the method's own where its files state them."""
-        return self.own_intrinsics.get(camera, self._camera(camera).intrinsics)
+        """``(3, 3)`` at the input resolution: the method's own where its files state them.
+
+        Raises ResultError where neither these nor the capture does.
+        """
+        own = self._camera(camera)
+        if camera not in self.own_intrinsics and not own.focal_known:
+            raise ResultError(
+                f"{self.folder}: does not state the intrinsics of {camera}, nor does the capture know its"
+                " focal length; import a format that does, such as nerfstudio or COLMAP"
+            )
+        return self.own_intrinsics.get(camera, own.intrinsics)
 
     def has_depth(self, camera: str, time: int) -> bool:
         """Whether there is a depth file of that frame."""
