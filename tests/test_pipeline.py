@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +18,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mvdyn_gtsam.capture import load_capture
+from mvdyn_gtsam.capture import FIRST_FOCAL, load_capture, with_unknown_focal
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.config import Config, load_config
 from mvdyn_gtsam.demo import demo_capture
-from mvdyn_gtsam.errors import DepthPriorError, ResultError
+from mvdyn_gtsam.errors import DepthPriorError, ResultError, TrackingError
+from mvdyn_gtsam.evaluation import evaluate
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, Float32, Image
 from mvdyn_gtsam.frontend.depth_priors.depth_prior import NoDepthPrior
-from mvdyn_gtsam.frontend.start.model import Start
+from mvdyn_gtsam.frontend.start.model import FocalLength, Start
 from mvdyn_gtsam.geometry import invert_pose, rotation_angle_deg
 from mvdyn_gtsam.pipeline import reconstruct
 from mvdyn_gtsam.progress import Progress
@@ -160,6 +163,29 @@ def test_a_stopped_run_continues_without_a_new_start(
     assert finished.manifest["status"] == "complete"
     assert list(stages(tmp_path)) == ALL_STAGES
     np.testing.assert_allclose(all_poses(finished), all_poses(result), atol=1e-9, rtol=0)
+
+
+def test_a_focal_length_is_found_once_and_used_by_all_stages(
+    result: Reconstruction, scene: Scene, start: GivenStart, tmp_path: Path
+) -> None:
+    capture = scene.capture()
+    known = capture.cameras
+    guessed = tuple(replace(c, fx=0.5 * c.fx, fy=0.5 * c.fx, focal_known=False) for c in known)
+    focal = {index: FocalLength(camera.fx, 0.3) for index, camera in enumerate(known)}
+    found = GivenStart(replace(start.start, focal=focal))
+    unknown = replace(capture, cameras=guessed)
+    with pytest.raises(StoppedError):
+        reconstruct(unknown, tmp_path, config(), initializer=found, flow=FlowThatStops(16))
+    finished = reconstruct(unknown, tmp_path, config(), initializer=found, resume=True)
+    assert found.calls == 1
+    # the guess, half of the truth, decides nothing
+    np.testing.assert_allclose(all_poses(finished), all_poses(result), atol=1e-9, rtol=0)
+    np.testing.assert_array_equal(finished.depth("cam1", 3), result.depth("cam1", 3))
+    for index, name in enumerate(finished.cameras):
+        for one in (finished, finished.tracked()):
+            np.testing.assert_array_equal(one.intrinsics(name), known[index].intrinsics)
+    (note, _) = finished.manifest["notes"]
+    assert note == f"cam0: focal length found in its video, {known[0].fx:.1f} px, give or take 0.3"
 
 
 def test_resuming_goes_on_with_the_settings_it_began_with(
@@ -313,6 +339,40 @@ def short_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     content = {"name": "short demo", "fps": clip.fps / 3, "cameras": entries}
     (folder / "capture.json").write_text(json.dumps(content))
     return folder
+
+
+def without_focal(capture: Capture) -> Capture:
+    """Guesses in the place of its focal lengths."""
+    guessed = tuple(
+        replace(camera, fx=FIRST_FOCAL * camera.width, fy=FIRST_FOCAL * camera.width)
+        for camera in capture.cameras
+    )
+    return with_unknown_focal(replace(capture, cameras=guessed))
+
+
+@pytest.mark.slow
+def test_the_classical_start_finds_focal_lengths(short_demo: Path, tmp_path: Path) -> None:
+    capture = load_capture(short_demo)
+    result = reconstruct(without_focal(capture), tmp_path / "out", stage="tracking")
+    assert result.groups == [["cam0", "cam1"]]
+    for camera in capture.cameras:
+        assert result.camera(camera.name).fx == pytest.approx(camera.fx, rel=0.02)
+        assert abs(FIRST_FOCAL * camera.width / camera.fx - 1.0) > 0.02
+    truth = tmp_path / "groundtruth"
+    truth.mkdir()
+    for path in (demo_capture() / "groundtruth").glob("*.txt"):
+        shutil.copy(path, truth)
+    scores = evaluate(result, truth)
+    assert scores.registered == 1.0 and scores.ate_m < 0.01
+
+
+@pytest.mark.slow
+def test_a_focal_length_that_the_videos_leave_open_ends_the_run_in_one_line(tmp_path: Path) -> None:
+    # two cameras that hardly turn
+    with pytest.raises(TrackingError, match="cam0: its video does not tell its focal length") as raised:
+        reconstruct(without_focal(two_cameras().capture()), tmp_path / "out", config())
+    assert "\n" not in str(raised.value)
+    assert stages(tmp_path / "out") == {}
 
 
 def mvdyn(*arguments: object) -> list[str]:

@@ -135,9 +135,11 @@ def _read_capture(capture_json: Path) -> Mapping[str, Any]:
     try:
         content = json.loads(capture_json.read_text())
     except (OSError, ValueError) as error:
-        raise EvaluationError(f"{capture_json}: depth_scale cannot be read ({error})") from error
+        raise EvaluationError(
+            f"{capture_json}: depth_scale and intrinsics cannot be read ({error})"
+        ) from error
     if not isinstance(content, dict):
-        raise EvaluationError(f"{capture_json}: depth_scale cannot be read (no object)")
+        raise EvaluationError(f"{capture_json}: depth_scale and intrinsics cannot be read (no object)")
     return content
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from mvdyn_gtsam.errors import EvaluationError
 from mvdyn_gtsam.evaluation.depth import fit_scale_and_offset, frame_depth_error
 from mvdyn_gtsam.evaluation.groundtruth import load_groundtruth
 from mvdyn_gtsam.evaluation.scores import evaluate
+from mvdyn_gtsam.frontend.dense_flow import pixel_raster
 from mvdyn_gtsam.geometry import Similarity
 from tests.evaluation.fakes import FakeReconstruction, random_poses, random_similarity, write_groundtruth
 
@@ -115,6 +117,23 @@ def test_the_strict_distance_sees_the_pose_and_the_other_does_not(scene: Scene) 
     assert depth is not None and reference is not None
     assert depth.m_d is not None and 0.03 < depth.m_d < 0.3
     assert depth.m_d_scale_only == pytest.approx(reference.m_d_scale_only, abs=1e-6)
+
+
+def test_a_wrong_focal_length_shows_in_the_points(scene: Scene) -> None:
+    reconstruction = scene.reconstruction(scene.depths)
+    K = reconstruction.intrinsics("cam0")
+    true = {"fx": K[0, 0] / 1.1, "fy": K[1, 1] / 1.1, "cx": K[0, 2], "cy": K[1, 2]}
+    entries = [{"name": camera, **true} for camera in ("cam0", "cam1")]
+    (scene.folder.parent / "capture.json").write_text(json.dumps({"depth_scale": 1e-4, "cameras": entries}))
+    scores = evaluate(reconstruction, scene.folder)
+    assert scores.depth is not None and scores.depth.abs_rel == pytest.approx(0.0, abs=1e-5)
+    # a tenth of how far the points lie from the axis
+    offsets = [
+        depth[..., None] * (pixel_raster(depth.shape) - K[:2, 2]) / (K[0, 0] / 1.1) * (0.1 / 1.1)
+        for depth in scene.depths.values()
+    ]
+    expected = np.median(np.linalg.norm(np.concatenate(offsets), axis=2))
+    assert scores.depth.m_d == pytest.approx(expected, rel=1e-3)
 
 
 def test_static_and_moving_pixels_are_told_apart(scene: Scene) -> None:

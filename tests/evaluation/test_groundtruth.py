@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -85,3 +86,14 @@ def test_a_bad_depth_scale_is_named(tmp_path: Path, content: str) -> None:
     (tmp_path / "capture.json").write_text(content)
     with pytest.raises(EvaluationError, match="capture.json: depth_scale"):
         load_groundtruth(tmp_path / "groundtruth")
+
+
+def test_intrinsics_are_those_that_the_capture_knows(tmp_path: Path) -> None:
+    folder = write_groundtruth(tmp_path, {"cam0": np.eye(4)[None]})
+    assert load_groundtruth(folder).intrinsics == {}
+    known = {"name": "cam0", "fx": 50, "fy": 51.0, "cx": 31.5, "cy": 23.5}
+    guess = {**known, "name": "cam1", "estimate_focal": True}
+    (tmp_path / "capture.json").write_text(json.dumps({"cameras": [known, guess, {"name": "cam2"}]}))
+    found = load_groundtruth(folder).intrinsics
+    assert list(found) == ["cam0"]
+    np.testing.assert_array_equal(found["cam0"], [[50.0, 0.0, 31.5], [0.0, 51.0, 23.5], [0.0, 0.0, 1.0]])

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factors.keys import S, X, camera_and_time, key_kind, key_name
+from factors.keys import F, M, S, X, camera_and_time, key_kind, key_name
 
 cameras = st.integers(0, 2**16 - 1)
 times = st.integers(0, 2**40 - 1)
@@ -27,6 +27,11 @@ def test_keys_sort_like_camera_and_time(first: tuple[int, int], second: tuple[in
 def test_out_of_range_is_refused(camera: int, time: int) -> None:
     with pytest.raises(ValueError, match="outside"):
         X(camera, time)
+
+
+def test_kinds_do_not_meet() -> None:
+    keys = {kind(2, 0) for kind in (X, S, M)} | {F(2)}
+    assert len(keys) == 4 and key_kind(F(2)) == "f" and F(1) != F(2)
 
 
 def test_gtsam_accepts_the_largest_key() -> None:

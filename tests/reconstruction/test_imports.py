@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from mvdyn_gtsam.capture import with_unknown_focal
 from mvdyn_gtsam.capture.model import Capture
 from mvdyn_gtsam.errors import ResultError
 from mvdyn_gtsam.geometry import invert_pose, project, transform_points
@@ -317,6 +318,10 @@ def test_names_tell_camera_and_frame(tmp_path: Path, pattern: str) -> None:
         np.testing.assert_allclose(result.trajectory(camera)[1], wTc, atol=1e-12)
     # Without intrinsics in the file, those of the capture.
     np.testing.assert_array_equal(result.intrinsics("cam1"), CAMERAS[1].intrinsics)
+    # but first guesses are none
+    guessed = replace(result, capture=with_unknown_focal(result.capture))
+    with pytest.raises(ResultError, match="does not state the intrinsics of cam1"):
+        guessed.intrinsics("cam1")
 
 
 @pytest.mark.parametrize(

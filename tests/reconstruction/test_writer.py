@@ -201,6 +201,46 @@ def test_resume_refuses_another_capture(tmp_path: Path) -> None:
         ReconstructionWriter.create(tmp_path, other, CONFIG, resume=True)
 
 
+def with_unknown(info: CaptureInfo, focal: float) -> CaptureInfo:
+    """The first camera's focal length is to be found; ``focal`` is the first guess."""
+    first = dataclasses.replace(info.cameras[0], fx=focal, fy=focal, focal_known=False)
+    return dataclasses.replace(info, cameras=(first, *info.cameras[1:]))
+
+
+def test_focal_lengths_that_are_found_are_the_cameras(tmp_path: Path) -> None:
+    info = with_unknown(capture_info(), 24.0)
+    with ReconstructionWriter.create(tmp_path, info, CONFIG) as writer:
+        assert writer.cameras == info.cameras
+        with pytest.raises(ValueError, match="unknown camera 'cam7'"):
+            writer.set_focal_lengths({"cam7": (1.0, 1.0)})
+        writer.set_focal_lengths({"cam0": (30.5, 0.2)})
+        assert writer.cameras[0].fx == 30.5
+    result = Reconstruction.load(tmp_path)
+    assert result.camera("cam0") == dataclasses.replace(info.cameras[0], fx=30.5, fy=30.5)
+    assert result.camera("left phone") == info.cameras[1]
+    assert result.intrinsics("cam0")[[0, 1, 0], [0, 1, 2]].tolist() == [30.5, 30.5, 15.5]
+    assert result.manifest["focal_lengths"] == {"cam0": {"pixels": 30.5, "deviation": 0.2}}
+    # the guess stays beside it, so that a resumed run knows its capture
+    with ReconstructionWriter.create(tmp_path, info, CONFIG, resume=True) as writer:
+        assert writer.cameras[0].fx == 30.5
+
+
+def test_resume_refuses_other_focal_lengths_to_be_found(tmp_path: Path) -> None:
+    write_complete(tmp_path)
+    unknown = with_unknown(capture_info(), 30.0)
+    with pytest.raises(ResultError, match="give or leave out --estimate-focal as then"):
+        ReconstructionWriter.create(tmp_path, unknown, CONFIG, resume=True)
+
+
+def test_what_older_versions_wrote_goes_on(tmp_path: Path) -> None:
+    write_complete(tmp_path)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert all("focal_known" not in camera for camera in manifest["capture"]["cameras"])
+    assert "focal_lengths" not in manifest
+    with ReconstructionWriter.create(tmp_path, capture_info(), CONFIG, resume=True) as writer:
+        assert writer.cameras == capture_info().cameras
+
+
 def test_resume_notes_where_the_capture_is_now(tmp_path: Path) -> None:
     for place in ("before", "after", None):
         info = dataclasses.replace(capture_info(), source=place)

@@ -40,6 +40,11 @@ def sightings(wTc: Array, camera: int = 0) -> Observations:
     return Observations(landmark, owner, frame, table[:, 3:], SCENE.points)
 
 
+def first_sighting(seen: Observations) -> Observations:
+    none = np.zeros(1, np.int64)
+    return Observations(none, none, none, seen.pixel[:1], seen.points[seen.landmark[:1]])
+
+
 def solved(wTc: Array) -> tuple[float, float]:
     """Focal length and its deviation, from 5 % off."""
     labels = {(0, frame): pose for frame, pose in enumerate(wTc)}
@@ -95,9 +100,7 @@ def test_known_focal_lengths_are_held_and_tell_the_others() -> None:
 
 def test_what_cannot_be_solved_is_left_open() -> None:
     wTc = turning()[2:3]
-    seen = sightings(wTc)
-    one = Observations(*(column[:1] * 0 for column in (seen.landmark, seen.camera, seen.frame)),
-                       seen.pixel[:1], SCENE.points[seen.landmark[:1]])  # fmt: skip
+    one = first_sighting(sightings(wTc))
     bundle = bundle_of([UNKNOWN], {(0, 0): wTc[0]}, one)
     # one sighting, and no gauge
     without = replace(bundle, graph=bundle.sightings)
@@ -107,9 +110,7 @@ def test_what_cannot_be_solved_is_left_open() -> None:
 
 def test_the_residual_and_its_derivative_by_the_focal_length() -> None:
     wTc = turning()[2:3]
-    seen = sightings(wTc)
-    one = Observations(*(column[5:6] * 0 for column in (seen.landmark, seen.camera, seen.frame)),
-                       seen.pixel[5:6], SCENE.points[seen.landmark[5:6]])  # fmt: skip
+    one = first_sighting(sightings(wTc))
     bundle = bundle_of([UNKNOWN], {(0, 0): wTc[0]}, one)
     x, y, z = transform_points(invert_pose(wTc[0]), one.points)[0]
     wrong = UNKNOWN.fx * np.array([x / z, y / z]) + [UNKNOWN.cx, UNKNOWN.cy] - one.pixel[0]
