@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import TrackingError
@@ -32,30 +33,57 @@ MOST_DEVIATION = 0.01
 experiments/focal.py."""
 
 
+@dataclass(frozen=True)
+class FocalMinima:
+    """Where bundle adjustment with a free focal length ends from each of several guesses; rows belong
+    together."""
+
+    guesses: npt.NDArray[np.float64]
+    """``(G,)`` px."""
+    focal: npt.NDArray[np.float64]
+    """``(G,)`` px, NaN where no map can be made."""
+    fitting: npt.NDArray[np.int64]
+    """``(G,)`` sightings that fit there."""
+
+    @property
+    def best(self) -> float | None:
+        """The focal length that most sightings fit, px; None where no map can be made from any guess."""
+        known = np.isfinite(self.focal)
+        if not known.any():
+            return None
+        return float(self.focal[int(np.argmax(np.where(known, self.fitting, -1)))])
+
+
+def focal_minima(camera: Camera, features: Sequence[Features], pairs: Matches) -> FocalMinima:
+    """What the camera's own guess and each of ``FOCAL_GUESSES`` lead to with its frames' ``features`` and the
+    matches of their ``pairs``; may be called from several threads. Raises TrackingError where the worker
+    fails."""
+    side = max(camera.width, camera.height)
+    guesses = np.array([camera.fx, *(share * side for share in FOCAL_GUESSES)])
+    if not pairs:
+        return FocalMinima(guesses, np.full(len(guesses), np.nan), np.zeros(len(guesses), np.int64))
+    problem = {**matched_views([camera], features, pairs), "focal_guesses": guesses}
+    found = structure_from_motion(camera.name, problem)
+    return FocalMinima(guesses, found["focal"], found["fitting"])
+
+
 def with_found_focal(camera: Camera, features: Sequence[Features], pairs: Matches) -> Camera:
     """The camera with the focal length that its frames' ``features`` and the matches of their ``pairs`` speak
     for; may be called from several threads.
 
     Raises TrackingError where they speak for none.
     """
-    side = max(camera.width, camera.height)
-    guesses = np.array([camera.fx, *(share * side for share in FOCAL_GUESSES)])
-    found = {"focal": np.full(0, np.nan), "fitting": np.zeros(0, int)}
-    if pairs:
-        problem = {**matched_views([camera], features, pairs), "focal_guesses": guesses}
-        found = structure_from_motion(camera.name, problem)
-    known = np.isfinite(found["focal"])
-    if not known.any():
+    minima = focal_minima(camera, features, pairs)
+    focal = minima.best
+    if focal is None:
         raise no_focal(camera, "no map can be made of it: it shows too little, or hardly any motion")
-    best = int(np.argmax(np.where(known, found["fitting"], -1)))
-    focal = float(found["focal"][best])
     logger.info(
         "%s: focal length %.1f px; from guesses %s ended %s, fitting sightings %s",
         camera.name,
         focal,
-        np.round(guesses).astype(int).tolist(),
-        np.round(found["focal"], 1).tolist(),
-        found["fitting"].tolist(),
+        np.round(minima.guesses).astype(int).tolist(),
+        np.round(minima.focal, 1).tolist(),
+        minima.fitting.tolist(),
     )
     return replace(camera, fx=focal, fy=focal)
 
