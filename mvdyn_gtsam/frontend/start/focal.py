@@ -26,11 +26,16 @@ logger = logging.getLogger(__name__)
 
 FOCAL_GUESSES = (0.6, 0.95, 1.2, 1.7)
 """Focal lengths tried besides the camera's own guess, in lengths of the longer side: fields of view of 80 to
-45 degrees, each within reach of the next. Source: experiments/focal.py."""
+33 degrees, each within reach of the next. Source: experiments/focal.py."""
 
 MOST_DEVIATION = 0.01
 """Standard deviation from which on a focal length is not told, as a share of it. Source:
 experiments/focal.py."""
+DOUBTED = 0.01
+"""By how much of it a given focal length must differ from what the images tell, to be doubted. Source:
+experiments/focal.py; twice what found ones were off on rendered scenes."""
+DOUBTED_DEVIATIONS = 5.0
+"""And by how many standard deviations. Source: choice."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +108,21 @@ def told_focal(adjusted: Adjusted) -> dict[int, FocalLength]:
         logger.info("%s: focal length %.1f px, give or take %.1f", camera.name, camera.fx, deviation)
         told[index] = FocalLength(camera.fx, deviation)
     return told
+
+
+def doubts(cameras: Sequence[Camera], adjusted: Adjusted) -> list[str]:
+    """A line for every camera of known focal length whose images tell another."""
+    lines = []
+    for index, told in adjusted.told_focal.items():
+        given = cameras[index].fx
+        off = abs(told.pixels - given)
+        if off > DOUBTED * given and off > DOUBTED_DEVIATIONS * told.deviation:
+            lines.append(
+                f"{cameras[index].name}: its intrinsics say a focal length of {given:.1f} px, and its images"
+                f" {told.pixels:.1f}, give or take {told.deviation:.1f}; check them, or have it found with"
+                " --estimate-focal"
+            )
+    return lines
 
 
 def no_focal(camera: Camera, reason: str) -> TrackingError:

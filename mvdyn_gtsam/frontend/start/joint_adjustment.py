@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -29,7 +30,7 @@ from mvdyn_gtsam.frontend.start.bundle import (
     solved_cameras,
 )
 from mvdyn_gtsam.frontend.start.features import Features
-from mvdyn_gtsam.frontend.start.model import StartFrame
+from mvdyn_gtsam.frontend.start.model import FocalLength, StartFrame
 from mvdyn_gtsam.frontend.start.single_camera import CameraMap
 from mvdyn_gtsam.frontend.threads import in_order
 from mvdyn_gtsam.geometry import Similarity, invert_pose, project, transform_points
@@ -38,6 +39,13 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
+LEAST_FRAMES = 3
+"""Of a camera, for its images to be asked for its focal length: those of a still one are a single image."""
+SQUARE = 0.002
+"""Share by which the two focal lengths of square pixels differ at most; calibrations find them that alike."""
+FOCAL_EFFORT = 100, 1e-5
+"""Iterations at most, and the share by which the cost falls in the last: a focal length that is let go
+follows a narrow valley. Source: experiments/focal.py."""
 MISFIT_PX = 4.0
 """Reprojection error beyond which a sighting is dropped; COLMAP's filter_max_reproj_error."""
 
@@ -75,6 +83,8 @@ class Adjusted:
     """With the focal lengths that were yet to be found."""
     focal_deviation: dict[int, float]
     """Of these, px; by camera."""
+    told_focal: dict[int, FocalLength]
+    """What the images say of those that are known, by camera, where that was asked."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +105,11 @@ def adjust_maps(
     wSm: Mapping[int, Similarity],
     same_point: Sequence[tuple[int, int, Index]],
     config: AdjustmentConfig,
+    ask_focal: bool = False,
 ) -> Adjusted:
     """Every placed camera in the common world, and the focal lengths that are not known.
+
+    With ``ask_focal`` also what the images say of those that are known.
 
     ``same_point`` holds ``(camera a, camera b, (M, 2) rows of map points that are one)``. After a first
     solution every point is looked for in every other frame, near where it should be: that closes loops
@@ -123,7 +136,32 @@ def adjust_maps(
         for camera in wSm
     }
     free = free_cameras(cameras, wTc)
-    return Adjusted(frames, state.cameras, focal_deviations(state.bundle, state.solution, free))
+    deviations = focal_deviations(state.bundle, state.solution, free)
+    return Adjusted(frames, state.cameras, deviations, _told_focal(state, times) if ask_focal else {})
+
+
+def _told_focal(state: _State, times: Mapping[Label, int]) -> dict[int, FocalLength]:
+    """What the images say of known focal lengths, all let go at once; of cameras with several frames and
+    square pixels."""
+    counts = Counter(camera for camera, _ in state.wTc)
+    asked = [
+        index
+        for index, count in counts.items()
+        if (camera := state.cameras[index]).focal_known
+        and count >= LEAST_FRAMES
+        and abs(camera.fy / camera.fx - 1.0) < SQUARE
+    ]
+    if not asked:
+        return {}
+    freed = [
+        replace(camera, focal_known=camera.focal_known and index not in asked)
+        for index, camera in enumerate(state.cameras)
+    ]
+    bundle = bundle_of(freed, state.wTc, state.observations)
+    solution = solve_bundle(bundle.graph, bundle.values, times, state.mounts, *FOCAL_EFFORT)
+    told = solved_cameras(freed, state.wTc, solution)
+    deviations = focal_deviations(bundle, solution, asked)
+    return {index: FocalLength(told[index].fx, deviations[index]) for index in asked}
 
 
 def _search(

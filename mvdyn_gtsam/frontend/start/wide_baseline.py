@@ -23,9 +23,9 @@ from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
 from mvdyn_gtsam.frontend.start.camera_maps import MappedCamera, map_camera
 from mvdyn_gtsam.frontend.start.dense_map import DenseMap
-from mvdyn_gtsam.frontend.start.focal import told_focal
+from mvdyn_gtsam.frontend.start.focal import doubts, told_focal
 from mvdyn_gtsam.frontend.start.groups import Judge, Placement, balance, connect
-from mvdyn_gtsam.frontend.start.joint_adjustment import adjust_maps
+from mvdyn_gtsam.frontend.start.joint_adjustment import FOCAL_EFFORT, adjust_maps
 from mvdyn_gtsam.frontend.start.lifted_points import lift_map, match_lifted
 from mvdyn_gtsam.frontend.start.model import FocalLength, Start, StartFrame, found_cameras
 from mvdyn_gtsam.frontend.start.placement import (
@@ -109,6 +109,7 @@ class ClassicalInitializer:
         ]
         frames: dict[int, tuple[StartFrame, ...]] = {}
         focal: dict[int, FocalLength] = {}
+        notes: list[str] = []
         for group in placed.groups:
             same_point: list[SamePoint] = [
                 (a, b, self._same_points(capture, matches[a, b], a, b, group))
@@ -120,15 +121,22 @@ class ClassicalInitializer:
             if any(camera in placed.maps or not cameras[camera].focal_known for camera in group):
                 # One view from far aside, and a focal length, converge along a narrow valley: an early end
                 # was 15 cm off.
-                adjustment = replace(adjustment, maximum_iterations=100, relative_tolerance=1e-5)
-            adjusted = adjust_maps(cameras, maps, group, same_point, adjustment)
+                iterations, tolerance = FOCAL_EFFORT
+                adjustment = replace(adjustment, maximum_iterations=iterations, relative_tolerance=tolerance)
+            adjusted = adjust_maps(cameras, maps, group, same_point, adjustment, ask_focal=True)
             frames |= adjusted.frames
             focal |= told_focal(adjusted)
+            for doubt in doubts(cameras, adjusted):
+                logger.warning(doubt)
+                notes.append(doubt)
         for camera in placed.maps:
             frames[camera] = frames_of_view(views[camera], capture.cameras[camera], frames[camera][0])
         groups = [tuple(sorted(group)) for group in placed.groups]
         start = Start(
-            tuple(groups), tuple(frames.get(camera, ()) for camera in range(len(maps))), focal=focal
+            tuple(groups),
+            tuple(frames.get(camera, ()) for camera in range(len(maps))),
+            notes=tuple(notes),
+            focal=focal,
         )
         capture = replace(capture, cameras=found_cameras(capture.cameras, start))
         return _with_lone_cameras(capture, start, views)
@@ -394,5 +402,5 @@ def _with_lone_cameras(capture: Capture, start: Start, views: Mapping[int, Still
         start,
         groups=(*start.groups, *((camera,) for camera in lone)),
         frames=tuple(frames),
-        notes=tuple(notes),
+        notes=(*start.notes, *notes),
     )

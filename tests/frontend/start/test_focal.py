@@ -12,7 +12,7 @@ import pytest
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.start import focal
 from mvdyn_gtsam.frontend.start.features import extract_features
-from mvdyn_gtsam.frontend.start.focal import MOST_DEVIATION, told_focal, with_found_focal
+from mvdyn_gtsam.frontend.start.focal import MOST_DEVIATION, doubts, told_focal, with_found_focal
 from mvdyn_gtsam.frontend.start.joint_adjustment import Adjusted
 from mvdyn_gtsam.frontend.start.model import FocalLength
 from mvdyn_gtsam.frontend.start.single_camera import match_neighbours
@@ -58,12 +58,25 @@ def test_a_video_that_makes_no_map_is_one_line_with_the_fix(monkeypatch: pytest.
 
 def test_what_the_images_leave_open_is_refused() -> None:
     def adjusted(deviation: float) -> Adjusted:
-        return Adjusted({}, (CAMERA, UNKNOWN), {1: deviation})
+        return Adjusted({}, (CAMERA, UNKNOWN), {1: deviation}, {})
 
     assert told_focal(adjusted(2.0)) == {1: FocalLength(384.0, 2.0)}
     for deviation in (1.1 * MOST_DEVIATION * 384.0, np.inf, np.nan):
         with pytest.raises(TrackingError, match="384 px fits best"):
             told_focal(adjusted(deviation))
+
+
+def test_given_focal_lengths_that_the_images_contradict_are_doubted() -> None:
+    def lines(pixels: float, deviation: float) -> list[str]:
+        told = {0: FocalLength(pixels, deviation)}
+        return doubts([CAMERA, UNKNOWN], Adjusted({}, (CAMERA, UNKNOWN), {}, told))
+
+    assert lines(430.0, 0.5) == []
+    # half a percent is what found ones err by, and 3 % is nothing where they may err by 2
+    assert lines(432.0, 0.1) == lines(443.0, 8.6) == []
+    (line,) = lines(412.0, 1.5)
+    assert "cam: its intrinsics say a focal length of 430.0 px, and its images 412.0" in line
+    assert "--estimate-focal" in line
 
 
 @pytest.mark.slow

@@ -67,9 +67,9 @@ def stacked(frames: dict[int, tuple[StartFrame, ...]]) -> Array:
     return np.stack([frame.wTc for camera in (0, 1) for frame in frames[camera]])
 
 
-def errors(wTc: Array) -> tuple[float, float]:
+def errors(wTc: Array, truth: Array | None = None) -> tuple[float, float]:
     """Largest errors after one scale about the first camera: position in median depths, rotation in deg."""
-    truth = np.concatenate(TRUTH)
+    truth = np.concatenate(TRUTH) if truth is None else truth
     own, true = (invert_pose(one[0]) @ one for one in (wTc, truth))
     scale = (own[:, :3, 3] * true[:, :3, 3]).sum() / (own[:, :3, 3] ** 2).sum()
     position = np.linalg.norm(scale * own[:, :3, 3] - true[:, :3, 3], axis=1).max()
@@ -119,6 +119,42 @@ def test_one_camera_alone_is_adjusted_too(maps: list[CameraMap]) -> None:
     wTc = np.stack([frame.wTc for frame in frames[0]])
     own, true = (invert_pose(one[0]) @ one for one in (wTc, TRUTH[0]))
     assert rotation_angle_deg((invert_pose(true) @ own)[:, :3, :3]).max() < 0.3
+
+
+def test_images_tell_the_focal_lengths_whether_they_are_known_or_not() -> None:
+    wrong = replace(CAMERA, fx=1.04 * CAMERA.fx, fy=1.04 * CAMERA.fy)
+    oblong = replace(wrong, fy=1.02 * CAMERA.fy)
+    unknown = replace(wrong, focal_known=False)
+    maps = [camera_map(camera, SCENE, turned(TRUTH[camera]), IDENTITY, noise_px=0.3) for camera in (0, 1)]
+    group = {0: IDENTITY, 1: IDENTITY}
+    pairs = [(0, 1, common_points(maps, 60))]
+    config = AdjustmentConfig(maximum_iterations=100, relative_tolerance=1e-5)
+    known = adjust_maps([wrong, wrong], maps, group, pairs, config, ask_focal=True)
+    # what is known is kept, and doubted
+    assert known.cameras == (wrong, wrong) and known.focal_deviation == {}
+    for told in known.told_focal.values():
+        assert abs(told.pixels / CAMERA.fx - 1.0) < 0.01 < wrong.fx / CAMERA.fx - 1.0
+        assert abs(told.pixels - CAMERA.fx) < 3.0 * told.deviation
+    assert len(known.told_focal) == 2
+    assert adjust_maps([wrong, wrong], maps, group, pairs, config).told_focal == {}
+    mixed = adjust_maps([oblong, unknown], maps, group, pairs, config, ask_focal=True)
+    assert mixed.told_focal == {} and mixed.cameras[0] == oblong
+    assert list(mixed.focal_deviation) == [1]
+    found = adjust_maps([CAMERA, unknown], maps, group, pairs, config)
+    assert found.cameras[0] == CAMERA
+    assert abs(found.cameras[1].fx / CAMERA.fx - 1.0) < 0.005
+    # poses come with the focal length
+    position, rotation = errors(stacked(found.frames), np.concatenate([turned(own) for own in TRUTH]))
+    assert position < 0.003 and rotation < 0.2
+
+
+def turned(wTc: Array) -> Array:
+    """A camera that looks around as it goes: otherwise its focal length stays open."""
+    result = wTc.copy()
+    for frame, pose in enumerate(result):
+        turn = Rotation.from_rotvec([0.06 * np.sin(2.0 * frame), 0.05 * np.cos(frame), 0.1 * np.sin(frame)])
+        pose[:3, :3] = pose[:3, :3] @ turn.as_matrix()
+    return result
 
 
 def every_sighting(maps: list[CameraMap]) -> Observations:
