@@ -21,9 +21,9 @@ from mvdyn_gtsam.memory import keep_freed_memory
 EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERNAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
 DESCRIPTION = """\
-Several people film one event with hand-held cameras. From the synchronised videos and their
-intrinsics, mvdyn recovers the pose of every camera and a dense depth map for every frame, all in
-one world frame, while things move in the scene."""
+Several people film one event with hand-held cameras. From the synchronised videos, with their
+intrinsics or without, mvdyn recovers the pose of every camera and a dense depth map for every frame,
+all in one world frame, while things move in the scene."""
 
 EPILOG = """\
 start here:

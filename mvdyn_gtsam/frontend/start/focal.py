@@ -122,6 +122,7 @@ def doubts(cameras: Sequence[Camera], adjusted: Adjusted) -> list[str]:
                 f" {told.pixels:.1f}, give or take {told.deviation:.1f}; check them, or have it found with"
                 " --estimate-focal"
             )
+            logger.warning(lines[-1])
     return lines
 
 

@@ -18,16 +18,16 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from mvdyn_gtsam.capture.model import Capture
+from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
 from mvdyn_gtsam.frontend.start.camera_maps import MappedCamera, map_camera
 from mvdyn_gtsam.frontend.start.dense_map import DenseMap
 from mvdyn_gtsam.frontend.start.focal import doubts, told_focal
 from mvdyn_gtsam.frontend.start.groups import Judge, Placement, balance, connect
-from mvdyn_gtsam.frontend.start.joint_adjustment import FOCAL_EFFORT, adjust_maps
+from mvdyn_gtsam.frontend.start.joint_adjustment import FOCAL_EFFORT, Adjusted, adjust_maps
 from mvdyn_gtsam.frontend.start.lifted_points import lift_map, match_lifted
-from mvdyn_gtsam.frontend.start.model import FocalLength, Start, StartFrame, found_cameras
+from mvdyn_gtsam.frontend.start.model import Start, found_cameras
 from mvdyn_gtsam.frontend.start.placement import (
     PointMatches,
     agreeing_pairs,
@@ -36,8 +36,8 @@ from mvdyn_gtsam.frontend.start.placement import (
     same_placement,
 )
 from mvdyn_gtsam.frontend.start.settings import WideBaselineConfig
-from mvdyn_gtsam.frontend.start.single_camera import choose_frames
-from mvdyn_gtsam.frontend.start.still_cameras import SamePoint, place_still_cameras
+from mvdyn_gtsam.frontend.start.single_camera import CameraMap, choose_frames
+from mvdyn_gtsam.frontend.start.still_cameras import SamePoint, StillPlacement, place_still_cameras
 from mvdyn_gtsam.frontend.start.still_view import StillView, build_still_view, frames_of_view, lone_frames
 from mvdyn_gtsam.frontend.start.trial import mend_placement
 from mvdyn_gtsam.frontend.start.verification import Verdict, verify_placement
@@ -107,39 +107,42 @@ class ClassicalInitializer:
             views[index].pinhole if index in placed.maps else camera
             for index, camera in enumerate(capture.cameras)
         ]
-        frames: dict[int, tuple[StartFrame, ...]] = {}
-        focal: dict[int, FocalLength] = {}
-        notes: list[str] = []
-        for group in placed.groups:
-            same_point: list[SamePoint] = [
-                (a, b, self._same_points(capture, matches[a, b], a, b, group))
-                for a, b in matches
-                if a in group and b in group
-            ]
-            same_point += [pairs for pairs in placed.same_point if pairs[0] in group and pairs[1] in group]
-            adjustment = config.adjustment
-            if any(camera in placed.maps or not cameras[camera].focal_known for camera in group):
-                # One view from far aside, and a focal length, converge along a narrow valley: an early end
-                # was 15 cm off.
-                iterations, tolerance = FOCAL_EFFORT
-                adjustment = replace(adjustment, maximum_iterations=iterations, relative_tolerance=tolerance)
-            adjusted = adjust_maps(cameras, maps, group, same_point, adjustment, ask_focal=True)
-            frames |= adjusted.frames
-            focal |= told_focal(adjusted)
-            for doubt in doubts(cameras, adjusted):
-                logger.warning(doubt)
-                notes.append(doubt)
+        adjusted = [self._adjusted(capture, cameras, maps, matches, placed, group) for group in placed.groups]
+        frames = {camera: own for one in adjusted for camera, own in one.frames.items()}
         for camera in placed.maps:
             frames[camera] = frames_of_view(views[camera], capture.cameras[camera], frames[camera][0])
-        groups = [tuple(sorted(group)) for group in placed.groups]
         start = Start(
-            tuple(groups),
-            tuple(frames.get(camera, ()) for camera in range(len(maps))),
-            notes=tuple(notes),
-            focal=focal,
+            groups=tuple(tuple(sorted(group)) for group in placed.groups),
+            frames=tuple(frames.get(camera, ()) for camera in range(len(maps))),
+            notes=tuple(doubt for one in adjusted for doubt in doubts(cameras, one)),
+            focal={camera: focal for one in adjusted for camera, focal in told_focal(one).items()},
         )
         capture = replace(capture, cameras=found_cameras(capture.cameras, start))
         return _with_lone_cameras(capture, start, views)
+
+    def _adjusted(
+        self,
+        capture: Capture,
+        cameras: Sequence[Camera],
+        maps: Sequence[CameraMap],
+        matches: Mapping[tuple[int, int], PointMatches],
+        placed: StillPlacement,
+        group: Mapping[int, Similarity],
+    ) -> Adjusted:
+        """The joint adjustment of one group."""
+        same_point: list[SamePoint] = [
+            (a, b, self._same_points(capture, matches[a, b], a, b, group))
+            for a, b in matches
+            if a in group and b in group
+        ]
+        same_point += [pairs for pairs in placed.same_point if pairs[0] in group and pairs[1] in group]
+        adjustment = self.config.adjustment
+        if any(camera in placed.maps or not cameras[camera].focal_known for camera in group):
+            # One view from far aside, and a focal length, converge along a narrow valley: an early end was
+            # 15 cm off.
+            iterations, tolerance = FOCAL_EFFORT
+            adjustment = replace(adjustment, maximum_iterations=iterations, relative_tolerance=tolerance)
+        return adjust_maps(cameras, maps, group, same_point, adjustment, ask_focal=True)
 
     def _still_views(self, capture: Capture, cameras: Sequence[int]) -> dict[int, StillView]:
         """The one image that each of these cameras makes up; none for a camera that does more than turn."""
