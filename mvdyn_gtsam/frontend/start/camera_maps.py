@@ -9,7 +9,7 @@ from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.start.dense_map import DenseMap, densify_map
 from mvdyn_gtsam.frontend.start.features import extract_features
-from mvdyn_gtsam.frontend.start.focal import no_focal, with_found_focal
+from mvdyn_gtsam.frontend.start.focal import focal_candidates, no_focal
 from mvdyn_gtsam.frontend.start.followed_keypoints import Matches, follow_keypoints, joined_matches
 from mvdyn_gtsam.frontend.start.settings import WideBaselineConfig
 from mvdyn_gtsam.frontend.start.single_camera import (
@@ -33,13 +33,19 @@ class MappedCamera:
     dense: DenseMap | None
     """None without parallax."""
 
+    @property
+    def rigidity(self) -> float:
+        """Share of the flow that the map explains; 0 without parallax."""
+        return 0.0 if self.dense is None else self.dense.rigidity
+
 
 def map_camera(capture: Capture, index: int, flow: DenseFlow, config: WideBaselineConfig) -> MappedCamera:
     """Structure from motion of one camera, and its dense depth where it shows any parallax.
 
     Where what moves outweighs what stands still, or a texture repeats, descriptors can tie a map to the wrong
     thing. A rigid scene then explains little of the flow; keypoints followed along that flow are added, and
-    of the two maps the one that explains more is kept. Raises TrackingError where the focal length is neither
+    of the two maps the one that explains more is kept; so it is of maps with different focal lengths, where
+    that is not known. Raises TrackingError where the focal length is neither
     known nor told by the video.
     """
     camera = capture.cameras[index]
@@ -50,35 +56,34 @@ def map_camera(capture: Capture, index: int, flow: DenseFlow, config: WideBaseli
         extract_features(capture.read(index, int(t)), config.features, config.contrast) for t in times
     ]
     matched = match_neighbours(features, config.neighbours, config.ratio)
-    if not camera.focal_known:
-        camera = with_found_focal(camera, features, usable_pairs(matched))
-        cameras = (*capture.cameras[:index], camera, *capture.cameras[index + 1 :])
-        capture = replace(capture, cameras=cameras)
     # Where the frames are closer, as many neighbours reach as far.
     spacing = max(motion / max(len(times) - 1, 1), 1e-6)
     reach = round(config.dense_map.neighbours * config.frame_step / spacing)
 
-    def solved(pairs: Matches) -> MappedCamera:
-        own = build_camera_map(
-            index, camera, times, features, pairs, minimum_angle_deg=config.minimum_parallax_deg
+    def solved(own: Camera, pairs: Matches) -> MappedCamera:
+        sparse = build_camera_map(
+            index, own, times, features, pairs, minimum_angle_deg=config.minimum_parallax_deg
         )
-        dense = densify_map(capture, own, flow, config.dense_map, reach) if own.has_depth else None
-        return MappedCamera(camera, own, dense)
+        if not sparse.has_depth:
+            return MappedCamera(own, sparse, None)
+        cameras = (*capture.cameras[:index], own, *capture.cameras[index + 1 :])
+        seen = replace(capture, cameras=cameras)
+        return MappedCamera(own, sparse, densify_map(seen, sparse, flow, config.dense_map, reach))
 
-    first = solved(matched)
+    candidates = [camera] if camera.focal_known else focal_candidates(camera, features, usable_pairs(matched))
+    first = max((solved(own, matched) for own in candidates), key=lambda mapped: mapped.rigidity)
     if first.dense is None and not camera.focal_known:
         raise no_focal(camera, "it shows no parallax: the camera stands still, or only turns")
-    if first.dense is None or first.dense.rigidity >= config.minimum_rigidity:
+    if first.dense is None or first.rigidity >= config.minimum_rigidity:
         return first
     followed = follow_keypoints(
         lambda row: capture.read(index, int(times[row])), features, config.neighbours, flow
     )
-    second = solved(joined_matches(matched, followed))
-    rigidity = 0.0 if second.dense is None else second.dense.rigidity
+    second = solved(first.camera, joined_matches(matched, followed))
     logger.info(
         "%s: its map explains %.0f %% of the flow, %.0f %% with keypoints followed along it",
         camera.name,
-        100.0 * first.dense.rigidity,
-        100.0 * rigidity,
+        100.0 * first.rigidity,
+        100.0 * second.rigidity,
     )
-    return second if rigidity > first.dense.rigidity else first
+    return max(first, second, key=lambda mapped: mapped.rigidity)

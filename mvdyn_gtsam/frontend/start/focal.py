@@ -1,8 +1,9 @@
 """The focal length of a camera that does not tell it, from its own video.
 
 Bundle adjustment with a free focal length ends in one of several minima where texture repeats or things move.
-So it begins from several guesses, and the one that most sightings fit is believed, unless the video leaves
-the focal length open.
+So it begins from several guesses. Keypoints do not tell which end is true, as those on what moves may fit a
+false one; how much of the dense flow the maps explain does (``camera_maps``). What the images leave open is
+refused.
 """
 
 from __future__ import annotations
@@ -27,6 +28,11 @@ logger = logging.getLogger(__name__)
 FOCAL_GUESSES = (0.6, 0.95, 1.2, 1.7)
 """Focal lengths tried besides the camera's own guess, in lengths of the longer side: fields of view of 80 to
 33 degrees, each within reach of the next. Source: experiments/focal.py."""
+SAME = 0.02
+"""Share by which two ends differ at most to be the same one. Source: experiments/focal.py."""
+LEAST_FITTING = 0.3
+"""Share of the most fitting sightings that an end needs to be considered. Source: choice; true ones had 0.56
+and more in experiments/focal.py."""
 
 MOST_DEVIATION = 0.01
 """Standard deviation from which on a focal length is not told, as a share of it. Source:
@@ -50,13 +56,16 @@ class FocalMinima:
     fitting: npt.NDArray[np.int64]
     """``(G,)`` sightings that fit there."""
 
-    @property
-    def best(self) -> float | None:
-        """The focal length that most sightings fit, px; None where no map can be made from any guess."""
-        known = np.isfinite(self.focal)
-        if not known.any():
-            return None
-        return float(self.focal[int(np.argmax(np.where(known, self.fitting, -1)))])
+    def distinct(self) -> list[float]:
+        """The focal lengths that differ, px, those that most sightings fit first, down to ``LEAST_FITTING``;
+        none where no map can be made from any guess."""
+        found: list[float] = []
+        order = np.argsort(-np.where(np.isfinite(self.focal), self.fitting, -1), kind="stable")
+        for focal, fitting in zip(self.focal[order], self.fitting[order], strict=True):
+            known = np.isfinite(focal) and fitting >= LEAST_FITTING * self.fitting[order[0]]
+            if known and all(abs(focal / other - 1.0) > SAME for other in found):
+                found.append(float(focal))
+        return found
 
 
 def focal_minima(camera: Camera, features: Sequence[Features], pairs: Matches) -> FocalMinima:
@@ -72,25 +81,24 @@ def focal_minima(camera: Camera, features: Sequence[Features], pairs: Matches) -
     return FocalMinima(guesses, found["focal"], found["fitting"])
 
 
-def with_found_focal(camera: Camera, features: Sequence[Features], pairs: Matches) -> Camera:
-    """The camera with the focal length that its frames' ``features`` and the matches of their ``pairs`` speak
-    for; may be called from several threads.
+def focal_candidates(camera: Camera, features: Sequence[Features], pairs: Matches) -> list[Camera]:
+    """The camera with every focal length that its frames' ``features`` and the matches of their ``pairs``
+    allow; may be called from several threads.
 
-    Raises TrackingError where they speak for none.
+    Raises TrackingError where they allow none.
     """
     minima = focal_minima(camera, features, pairs)
-    focal = minima.best
-    if focal is None:
-        raise no_focal(camera, "no map can be made of it: it shows too little, or hardly any motion")
     logger.info(
-        "%s: focal length %.1f px; from guesses %s ended %s, fitting sightings %s",
+        "%s: focal lengths from guesses %s px ended %s, fitting sightings %s",
         camera.name,
-        focal,
         np.round(minima.guesses).astype(int).tolist(),
         np.round(minima.focal, 1).tolist(),
         minima.fitting.tolist(),
     )
-    return replace(camera, fx=focal, fy=focal)
+    distinct = minima.distinct()
+    if not distinct:
+        raise no_focal(camera, "no map can be made of it: it shows too little, or hardly any motion")
+    return [replace(camera, fx=focal, fy=focal) for focal in distinct]
 
 
 def told_focal(adjusted: Adjusted) -> dict[int, FocalLength]:

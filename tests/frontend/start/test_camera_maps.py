@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mvdyn_gtsam.capture.model import Capture
+from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.dense_flow import DisFlow
 from mvdyn_gtsam.frontend.start import camera_maps
 from mvdyn_gtsam.frontend.start.camera_maps import map_camera
@@ -67,3 +68,30 @@ def test_of_two_maps_the_one_that_explains_more_is_kept(
 def test_a_second_map_without_depth_is_none(monkeypatch: pytest.MonkeyPatch, capture: Capture) -> None:
     own, dense, made = kept(monkeypatch, capture, WITHOUT_DEPTH, {"first": 0.5})
     assert own is FIRST and dense is not None and made == 2
+
+
+def test_of_several_focal_lengths_the_one_whose_map_explains_most_is_kept(
+    monkeypatch: pytest.MonkeyPatch, capture: Capture
+) -> None:
+    unknown = replace(capture.cameras[0], focal_known=False)
+    ends = {900.0: 0.8, 150.0: 0.97, 300.0: 0.85}
+
+    def build(*arguments: Any, **_: object) -> CameraMap:
+        return FIRST
+
+    def densify(seen: Capture, own: CameraMap, *_: Any) -> DenseMap:
+        return DenseMap(own, (), ends[seen.cameras[0].fx])
+
+    monkeypatch.setattr(
+        camera_maps,
+        "focal_candidates",
+        lambda camera, *_: [replace(camera, fx=focal, fy=focal) for focal in ends],
+    )
+    monkeypatch.setattr(camera_maps, "build_camera_map", build)
+    monkeypatch.setattr(camera_maps, "densify_map", densify)
+    unsure = replace(capture, cameras=(unknown,))
+    mapped = map_camera(unsure, 0, DisFlow(), CONFIG)
+    assert mapped.camera == replace(unknown, fx=150.0, fy=150.0) and mapped.rigidity == 0.97
+    monkeypatch.setattr(camera_maps, "build_camera_map", lambda *_, **__: WITHOUT_DEPTH)
+    with pytest.raises(TrackingError, match="shows no parallax"):
+        map_camera(unsure, 0, DisFlow(), CONFIG)

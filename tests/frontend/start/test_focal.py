@@ -12,7 +12,7 @@ import pytest
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.start import focal
 from mvdyn_gtsam.frontend.start.features import extract_features
-from mvdyn_gtsam.frontend.start.focal import MOST_DEVIATION, doubts, told_focal, with_found_focal
+from mvdyn_gtsam.frontend.start.focal import MOST_DEVIATION, doubts, focal_candidates, told_focal
 from mvdyn_gtsam.frontend.start.joint_adjustment import Adjusted
 from mvdyn_gtsam.frontend.start.model import FocalLength
 from mvdyn_gtsam.frontend.start.single_camera import match_neighbours
@@ -36,11 +36,11 @@ def answer(monkeypatch: pytest.MonkeyPatch, ended: list[float], fitting: list[in
     return asked
 
 
-def test_the_focal_length_that_most_sightings_fit_is_believed(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = answer(monkeypatch, [577.0, 430.2, np.nan, 430.1, 700.0], [800, 1200, 9000, 1190, 3])
-    found = with_found_focal(UNKNOWN, [VIEW, VIEW], PAIRS)
-    assert (found.fx, found.fy, found.focal_known) == (430.2, 430.2, False)
-    assert (found.cx, found.cy) == (CAMERA.cx, CAMERA.cy)
+def test_every_focal_length_that_sightings_fit_is_a_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = answer(monkeypatch, [577.0, 430.2, np.nan, 431.0, 700.0], [800, 1200, 9000, 1190, 3])
+    candidates = focal_candidates(UNKNOWN, [VIEW, VIEW], PAIRS)
+    # 431 is 430.2 again, and 700 fits nothing
+    assert candidates == [replace(UNKNOWN, fx=focal, fy=focal) for focal in (430.2, 577.0)]
     ((whose, problem),) = asked
     assert whose == CAMERA.name
     # the camera's own guess, then those that reach the common fields of view
@@ -53,7 +53,7 @@ def test_a_video_that_makes_no_map_is_one_line_with_the_fix(monkeypatch: pytest.
     answer(monkeypatch, [np.nan] * 5, [0] * 5)
     for pairs in (PAIRS, {}):
         with pytest.raises(TrackingError, match="cam: its video does not tell its focal length.*give its"):
-            with_found_focal(UNKNOWN, [VIEW, VIEW], pairs)
+            focal_candidates(UNKNOWN, [VIEW, VIEW], pairs)
 
 
 def test_what_the_images_leave_open_is_refused() -> None:
@@ -86,5 +86,5 @@ def test_the_focal_length_of_a_moving_camera_is_found() -> None:
         features = [extract_features(image, 1000, 0.01) for image in images]
         side = max(camera.width, camera.height)
         unknown = replace(camera, fx=0.75 * side, fy=0.75 * side, focal_known=False)
-        found = with_found_focal(unknown, features, match_neighbours(features, 4, 0.8))
+        found, *_ = focal_candidates(unknown, features, match_neighbours(features, 4, 0.8))
         assert found.fx == pytest.approx(camera.fx, rel=0.03)
