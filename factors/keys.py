@@ -1,11 +1,11 @@
 """Variable keys of the graph: pose ``X`` and log depth scale ``S`` of a (camera, time) frame, mount ``M``,
-focal length ``F`` of a camera.
+intrinsics ``F`` of a camera.
 
 A key packs ``character (8 bits) | camera (16 bits) | time (40 bits)`` into one integer, so sorting keys sorts
 by kind, camera and time. ``gtsam.DefaultKeyFormatter`` prints the character and one number; use ``key_name``.
 ``X`` holds a ``gtsam.Pose3`` (wTc), ``S`` a plain double (``values.insert(S(c, t), 0.0)``, ``atDouble``),
 ``M`` the ``gtsam.Pose3`` aTb of two cameras a and b mounted on one another, b in place of the time,
-``F`` a ``gtsam.Cal3f``.
+``F`` a ``gtsam.Cal3_S2``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def M(camera_a: int, camera_b: int) -> int:  # noqa: N802 - in line with the oth
 
 
 def F(camera: int) -> int:  # noqa: N802 - in line with the others
-    """Key of the focal length of a camera, the same at all times."""
+    """Key of the intrinsics of a camera, its focal length above all, the same at all times."""
     return _pack("f", camera, 0)
 
 

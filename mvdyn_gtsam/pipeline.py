@@ -88,7 +88,7 @@ def reconstruct(
         if not writer.stage_finished("tracking"):
             start = _start(capture, initializer, writer, progress)
             capture = replace(capture, cameras=found_cameras(capture.cameras, start))
-            _note_focal_lengths(capture, start, writer)
+            _note_intrinsics(capture, start, writer)
             writer.set_groups([[capture.cameras[camera].name for camera in group] for group in start.groups])
             _note_groups(capture, start, writer)
             with _aligned(depth_prior, capture, start, writer, progress) as prior:
@@ -116,13 +116,15 @@ def _start(
     return start
 
 
-def _note_focal_lengths(capture: Capture, start: Start, writer: ReconstructionWriter) -> None:
-    named = {capture.cameras[index].name: focal for index, focal in start.focal.items()}
-    writer.set_focal_lengths({name: (focal.pixels, focal.deviation) for name, focal in named.items()})
-    for name, focal in named.items():
+def _note_intrinsics(capture: Capture, start: Start, writer: ReconstructionWriter) -> None:
+    """Write down what the start found; ``capture`` has it already."""
+    found = {capture.cameras[index].name: own for index, own in start.intrinsics.items()}
+    cameras = {capture.cameras[index].name: capture.cameras[index] for index in start.intrinsics}
+    writer.set_found_intrinsics(cameras, {name: own.deviation for name, own in found.items()})
+    for name, own in found.items():
         writer.add_note(
-            f"{name}: focal length found in its video, {focal.pixels:.1f} px,"
-            f" give or take {focal.deviation:.1f}"
+            f"{name}: focal length found in its video, {own.focal:.1f} px, give or take {own.deviation:.1f};"
+            f" principal point ({own.cx:.1f}, {own.cy:.1f})"
         )
 
 

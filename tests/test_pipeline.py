@@ -26,7 +26,7 @@ from mvdyn_gtsam.errors import DepthPriorError, ResultError, TrackingError
 from mvdyn_gtsam.evaluation import evaluate
 from mvdyn_gtsam.frontend.dense_flow import DisFlow, Float32, Image
 from mvdyn_gtsam.frontend.depth_priors.depth_prior import NoDepthPrior
-from mvdyn_gtsam.frontend.start.model import FocalLength, Start
+from mvdyn_gtsam.frontend.start.model import FoundIntrinsics, Start
 from mvdyn_gtsam.geometry import invert_pose, rotation_angle_deg
 from mvdyn_gtsam.pipeline import reconstruct
 from mvdyn_gtsam.progress import Progress
@@ -170,9 +170,9 @@ def test_a_focal_length_is_found_once_and_used_by_all_stages(
 ) -> None:
     capture = scene.capture()
     known = capture.cameras
-    guessed = tuple(replace(c, fx=0.5 * c.fx, fy=0.5 * c.fx, focal_known=False) for c in known)
-    focal = {index: FocalLength(camera.fx, 0.3) for index, camera in enumerate(known)}
-    found = GivenStart(replace(start.start, focal=focal))
+    guessed = tuple(replace(c, fx=0.5 * c.fx, fy=0.5 * c.fx, cx=c.cx - 3.0, focal_known=False) for c in known)
+    intrinsics = {index: FoundIntrinsics(c.fx, c.cx, c.cy, 0.3) for index, c in enumerate(known)}
+    found = GivenStart(replace(start.start, intrinsics=intrinsics))
     unknown = replace(capture, cameras=guessed)
     with pytest.raises(StoppedError):
         reconstruct(unknown, tmp_path, config(), initializer=found, flow=FlowThatStops(16))
@@ -185,7 +185,9 @@ def test_a_focal_length_is_found_once_and_used_by_all_stages(
         for one in (finished, finished.tracked()):
             np.testing.assert_array_equal(one.intrinsics(name), known[index].intrinsics)
     (note, _) = finished.manifest["notes"]
-    assert note == f"cam0: focal length found in its video, {known[0].fx:.1f} px, give or take 0.3"
+    assert note.startswith(
+        f"cam0: focal length found in its video, {known[0].fx:.1f} px, give or take 0.3; principal point ("
+    )
 
 
 def test_resuming_goes_on_with_the_settings_it_began_with(

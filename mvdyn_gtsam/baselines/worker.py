@@ -77,7 +77,7 @@ def _reconstruct(request: Request, capture: Capture, work: Path, writer: Reconst
     if request.method == "glomap" and any(known) and not all(known):
         writer.add_note(ALL_FOCALS_REFINED)
     refined = zip(capture.cameras, sfm.read_cameras(model, capture.cameras), strict=True)
-    writer.set_focal_lengths({now.name: (now.fx, None) for before, now in refined if now != before})
+    writer.set_found_intrinsics({now.name: now for before, now in refined if now != before}, {})
 
 
 def _match(request: Request, capture: Capture, work: Path, phases: Phases) -> SharedCost:

@@ -31,7 +31,7 @@ CONVENTIONS = {
     "pixels": "integer coordinates are pixel centres;"
     " a centred principal point is ((width - 1) / 2, (height - 1) / 2)",
     "intrinsics": "pinhole at the input resolution, of the undistorted frames; of a camera whose focal_known"
-    " is false those of capture are first guesses, and focal_lengths has what was found, in px",
+    " is false those of capture are first guesses, and found_intrinsics has what was found, in px",
     "depth": f"z-depth (not ray length) at the input resolution; {DEPTH_ENCODING}; NaN once read",
     "confidence": f"0 (do not use) to 1; {CONFIDENCE_ENCODING}",
     "groups": "cameras of one group share one world frame and one scale; different groups do not",
@@ -150,22 +150,25 @@ def is_reconstruction(folder: Path) -> bool:
 
 
 def cameras_of(manifest: Mapping[str, Any]) -> tuple[Camera, ...]:
-    """The cameras of a manifest, with the focal lengths that were found."""
+    """The cameras of a manifest, with the intrinsics that were found."""
     return tuple(
         Camera(
             **{
                 **entry,
                 "distortion": tuple(entry.get("distortion", ())),
-                **_found_focal(manifest, entry["name"]),
+                **_found_intrinsics(manifest, entry["name"]),
             }
         )
         for entry in manifest["capture"]["cameras"]
     )
 
 
-def _found_focal(manifest: Mapping[str, Any], camera: str) -> dict[str, float]:
-    found = manifest.get("focal_lengths", {}).get(camera)
-    return {} if found is None else {"fx": float(found["pixels"]), "fy": float(found["pixels"])}
+def _found_intrinsics(manifest: Mapping[str, Any], camera: str) -> dict[str, float]:
+    found = manifest.get("found_intrinsics", {}).get(camera)
+    if found is None:
+        return {}
+    focal = float(found["focal"])
+    return {"fx": focal, "fy": focal, "cx": float(found["cx"]), "cy": float(found["cy"])}
 
 
 def _layout_problem(manifest: Mapping[str, Any]) -> str | None:

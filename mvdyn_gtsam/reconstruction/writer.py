@@ -247,19 +247,20 @@ class ReconstructionWriter:
         self._manifest["groups"] = [list(group) for group in groups]
         self._write_manifest()
 
-    def set_focal_lengths(self, found: Mapping[str, tuple[float, float | None]]) -> None:
-        """Set the focal lengths that were found, by camera, and their standard deviations where known, px."""
+    def set_found_intrinsics(self, found: Mapping[str, Camera], deviation: Mapping[str, float]) -> None:
+        """Set the cameras, by name, whose intrinsics were found, and the standard deviations of their focal
+        lengths where known, px."""
         for camera in found:
             self._check_camera(camera)
-        self._manifest["focal_lengths"] = {
-            camera: {"pixels": pixels, "deviation": deviation}
-            for camera, (pixels, deviation) in found.items()
+        self._manifest["found_intrinsics"] = {
+            name: {"focal": camera.fx, "cx": camera.cx, "cy": camera.cy, "deviation": deviation.get(name)}
+            for name, camera in found.items()
         }
         self._write_manifest()
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """Those of the capture, with the focal lengths that were found."""
+        """Those of the capture, with the intrinsics that were found."""
         return cameras_of(self._manifest)
 
     def set_unit(self, unit: str) -> None:

@@ -212,14 +212,16 @@ def test_focal_lengths_that_are_found_are_the_cameras(tmp_path: Path) -> None:
     with ReconstructionWriter.create(tmp_path, info, CONFIG) as writer:
         assert writer.cameras == info.cameras
         with pytest.raises(ValueError, match="unknown camera 'cam7'"):
-            writer.set_focal_lengths({"cam7": (1.0, 1.0)})
-        writer.set_focal_lengths({"cam0": (30.5, 0.2)})
-        assert writer.cameras[0].fx == 30.5
+            writer.set_found_intrinsics({"cam7": info.cameras[0]}, {})
+        found = dataclasses.replace(info.cameras[0], fx=30.5, fy=30.5, cx=15.25, cy=11.75)
+        writer.set_found_intrinsics({"cam0": found}, {"cam0": 0.2})
+        assert writer.cameras == (found, info.cameras[1])
     result = Reconstruction.load(tmp_path)
-    assert result.camera("cam0") == dataclasses.replace(info.cameras[0], fx=30.5, fy=30.5)
+    assert result.camera("cam0") == found
     assert result.camera("left phone") == info.cameras[1]
-    assert result.intrinsics("cam0")[[0, 1, 0], [0, 1, 2]].tolist() == [30.5, 30.5, 15.5]
-    assert result.manifest["focal_lengths"] == {"cam0": {"pixels": 30.5, "deviation": 0.2}}
+    assert result.intrinsics("cam0")[[0, 1, 0], [0, 1, 2]].tolist() == [30.5, 30.5, 15.25]
+    entry = {"focal": 30.5, "cx": 15.25, "cy": 11.75, "deviation": 0.2}
+    assert result.manifest["found_intrinsics"] == {"cam0": entry}
     # the guess stays beside it, so that a resumed run knows its capture
     with ReconstructionWriter.create(tmp_path, info, CONFIG, resume=True) as writer:
         assert writer.cameras[0].fx == 30.5
@@ -236,7 +238,7 @@ def test_what_older_versions_wrote_goes_on(tmp_path: Path) -> None:
     write_complete(tmp_path)
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     assert all("focal_known" not in camera for camera in manifest["capture"]["cameras"])
-    assert "focal_lengths" not in manifest
+    assert "found_intrinsics" not in manifest
     with ReconstructionWriter.create(tmp_path, capture_info(), CONFIG, resume=True) as writer:
         assert writer.cameras == capture_info().cameras
 

@@ -22,6 +22,9 @@ Label = tuple[int, int]
 
 ROBUST_PX = 1.0
 """Cauchy scale of reprojection errors; SIFT is good to about half a pixel."""
+SQUARE_SIGMA = 0.05
+"""Difference of both focal lengths that is left to square pixels, and the skew, px: none to speak of, and not
+so little that the system becomes singular."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +56,16 @@ class Bundle:
     """Keys."""
 
 
-def bundle_of(cameras: Sequence[Camera], wTc: Mapping[Label, Array], observations: Observations) -> Bundle:
-    """One reprojection factor per sighting; the focal lengths of cameras that do not tell them are free."""
+def bundle_of(
+    cameras: Sequence[Camera],
+    wTc: Mapping[Label, Array],
+    observations: Observations,
+    centres: Sequence[tuple[float, float]],
+    centre_sigma: float,
+) -> Bundle:
+    """One reprojection factor per sighting; the focal lengths of cameras that do not tell them are free, and
+    so are their principal points, about ``centres`` of all cameras, with that standard deviation in lengths
+    of the longer side."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for (camera, frame), pose in wTc.items():
         values.insert(X(camera, frame), gtsam.Pose3(pose))
@@ -66,7 +77,7 @@ def bundle_of(cameras: Sequence[Camera], wTc: Mapping[Label, Array], observation
     )
     calibrations = [gtsam.Cal3_S2(c.fx, c.fy, 0.0, c.cx, c.cy) for c in cameras]
     for free in free_cameras(cameras, wTc):
-        values.insert(F(free), gtsam.Cal3f(cameras[free].fx, cameras[free].cx, cameras[free].cy))
+        values.insert(F(free), calibrations[free])
     for landmark, camera, frame, pixel in zip(
         observations.landmark.tolist(),
         observations.camera.tolist(),
@@ -79,10 +90,32 @@ def bundle_of(cameras: Sequence[Camera], wTc: Mapping[Label, Array], observation
             known = calibrations[camera]
             graph.add(gtsam.GenericProjectionFactorCal3_S2(pixel, noise, *keys, known, False, False))
         else:
-            graph.add(gtsam.GeneralSFMFactor2Cal3f(pixel, noise, *keys, F(camera)))
+            graph.add(gtsam.GeneralSFMFactor2Cal3_S2(pixel, noise, *keys, F(camera)))
     gauged = gtsam.NonlinearFactorGraph(graph)
     _fix_gauge(gauged, wTc, observations, landmark_key)
+    for free in free_cameras(cameras, wTc):
+        sigma = centre_sigma * max(cameras[free].width, cameras[free].height)
+        gauged.add(_lens_prior(F(free), cameras[free].fx, centres[free], sigma))
     return Bundle(graph, gauged, values, landmark_key)
+
+
+def _lens_prior(
+    key: int, focal: float, centre: tuple[float, float], sigma: float
+) -> gtsam.PriorFactorCal3_S2:
+    """Square pixels, no skew, and a principal point near ``centre``, px; nothing of the focal length but
+    what a first linearisation needs."""
+    information = np.zeros((5, 5))
+    information[:2, :2] = SQUARE_SIGMA**-2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    information[:2, :2] += (10.0 * focal) ** -2 * np.eye(2)
+    information[2, 2] = SQUARE_SIGMA**-2
+    information[3, 3] = information[4, 4] = sigma**-2
+    noise = gtsam.noiseModel.Gaussian.Information(information)
+    return gtsam.PriorFactorCal3_S2(key, gtsam.Cal3_S2(focal, focal, 0.0, *centre), noise)
+
+
+def centres_of(cameras: Sequence[Camera]) -> list[tuple[float, float]]:
+    """Principal points, px."""
+    return [(camera.cx, camera.cy) for camera in cameras]
 
 
 def free_cameras(cameras: Sequence[Camera], wTc: Mapping[Label, Array]) -> list[int]:
@@ -93,11 +126,12 @@ def free_cameras(cameras: Sequence[Camera], wTc: Mapping[Label, Array]) -> list[
 def solved_cameras(
     cameras: Sequence[Camera], wTc: Mapping[Label, Array], solution: gtsam.Values
 ) -> tuple[Camera, ...]:
-    """The cameras with the focal lengths of a solution."""
+    """The cameras with the focal lengths and principal points of a solution."""
     result = list(cameras)
     for camera in free_cameras(cameras, wTc):
-        focal = solution.atCal3f(F(camera)).fx()
-        result[camera] = replace(cameras[camera], fx=focal, fy=focal)
+        found = solution.atCal3_S2(F(camera))
+        focal = 0.5 * (found.fx() + found.fy())
+        result[camera] = replace(cameras[camera], fx=focal, fy=focal, cx=found.px(), cy=found.py())
     return tuple(result)
 
 

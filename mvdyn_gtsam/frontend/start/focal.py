@@ -20,7 +20,7 @@ from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.start.features import Features
 from mvdyn_gtsam.frontend.start.followed_keypoints import Matches
 from mvdyn_gtsam.frontend.start.joint_adjustment import Adjusted
-from mvdyn_gtsam.frontend.start.model import FocalLength
+from mvdyn_gtsam.frontend.start.model import FoundIntrinsics
 from mvdyn_gtsam.frontend.start.structure_from_motion import matched_views, structure_from_motion
 
 logger = logging.getLogger(__name__)
@@ -101,12 +101,12 @@ def focal_candidates(camera: Camera, features: Sequence[Features], pairs: Matche
     return [replace(camera, fx=focal, fy=focal) for focal in distinct]
 
 
-def told_focal(adjusted: Adjusted) -> dict[int, FocalLength]:
-    """The focal lengths that a joint adjustment found, by camera.
+def found_intrinsics(adjusted: Adjusted) -> dict[int, FoundIntrinsics]:
+    """The intrinsics that a joint adjustment found, by camera.
 
     Raises TrackingError where the images leave one open.
     """
-    told = {}
+    found = {}
     for index, deviation in adjusted.focal_deviation.items():
         camera = adjusted.cameras[index]
         if not deviation < MOST_DEVIATION * camera.fx:
@@ -114,8 +114,8 @@ def told_focal(adjusted: Adjusted) -> dict[int, FocalLength]:
                 camera, f"{camera.fx:.0f} px fits best, give or take {100.0 * deviation / camera.fx:.0f} %"
             )
         logger.info("%s: focal length %.1f px, give or take %.1f", camera.name, camera.fx, deviation)
-        told[index] = FocalLength(camera.fx, deviation)
-    return told
+        found[index] = FoundIntrinsics(camera.fx, camera.cx, camera.cy, deviation)
+    return found
 
 
 def doubts(cameras: Sequence[Camera], adjusted: Adjusted) -> list[str]:
@@ -123,11 +123,11 @@ def doubts(cameras: Sequence[Camera], adjusted: Adjusted) -> list[str]:
     lines = []
     for index, told in adjusted.told_focal.items():
         given = cameras[index].fx
-        off = abs(told.pixels - given)
+        off = abs(told.focal - given)
         if off > DOUBTED * given and off > DOUBTED_DEVIATIONS * told.deviation:
             lines.append(
                 f"{cameras[index].name}: its intrinsics say a focal length of {given:.1f} px, and its images"
-                f" {told.pixels:.1f}, give or take {told.deviation:.1f}; check them, or have it found with"
+                f" {told.focal:.1f}, give or take {told.deviation:.1f}; check them, or have it found with"
                 " --estimate-focal"
             )
             logger.warning(lines[-1])

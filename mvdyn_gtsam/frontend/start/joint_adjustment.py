@@ -24,13 +24,14 @@ from mvdyn_gtsam.frontend.start.bundle import (
     Label,
     Observations,
     bundle_of,
+    centres_of,
     focal_deviations,
     free_cameras,
     solve_bundle,
     solved_cameras,
 )
 from mvdyn_gtsam.frontend.start.features import Features
-from mvdyn_gtsam.frontend.start.model import FocalLength, StartFrame
+from mvdyn_gtsam.frontend.start.model import FoundIntrinsics, StartFrame
 from mvdyn_gtsam.frontend.start.single_camera import CameraMap
 from mvdyn_gtsam.frontend.threads import in_order
 from mvdyn_gtsam.geometry import Similarity, invert_pose, project, transform_points
@@ -41,6 +42,8 @@ logger = logging.getLogger(__name__)
 
 LEAST_FRAMES = 3
 """Of a camera, for its images to be asked for its focal length: those of a still one are a single image."""
+HELD = 1e-4
+"""For ``centre_sigma``: known principal points stay."""
 SQUARE = 0.002
 """Share by which the two focal lengths of square pixels differ at most; calibrations find them that alike."""
 FOCAL_EFFORT = 100, 1e-5
@@ -64,6 +67,9 @@ class AdjustmentConfig:
     """Levenberg-Marquardt iterations per round. Source: choice, time."""
     relative_tolerance: float = 1e-3
     """Relative decrease of the cost at which a round ends. Source: choice, time."""
+    centre_sigma: float = 0.005
+    """Standard deviation of a principal point that is not known from what is given, or from the image's
+    centre, in lengths of the longer side. Source: experiments/focal.py, 0 to 0.01."""
     rig: RigConfig = field(default_factory=RigConfig)
 
     def __post_init__(self) -> None:
@@ -71,6 +77,8 @@ class AdjustmentConfig:
             raise ConfigError("frontend.wide_baseline.adjustment: at least 1 iteration, tolerance above 0")
         if self.points_per_camera < 50 or any(radius <= 0.0 for radius in self.search_px):
             raise ConfigError("frontend.wide_baseline.adjustment: points_per_camera >= 50, search_px above 0")
+        if not self.centre_sigma > 0.0:
+            raise ConfigError("frontend.wide_baseline.adjustment: centre_sigma above 0")
 
 
 @dataclass(frozen=True)
@@ -80,10 +88,10 @@ class Adjusted:
     frames: dict[int, tuple[StartFrame, ...]]
     """By camera, sparse depths included."""
     cameras: tuple[Camera, ...]
-    """With the focal lengths that were yet to be found."""
+    """With the intrinsics that were yet to be found."""
     focal_deviation: dict[int, float]
-    """Of these, px; by camera."""
-    told_focal: dict[int, FocalLength]
+    """Of these cameras, px."""
+    told_focal: dict[int, FoundIntrinsics]
     """What the images say of those that are known, by camera, where that was asked."""
 
 
@@ -122,10 +130,11 @@ def adjust_maps(
         for frame, pose in enumerate(similarity.transform_poses(maps[camera].mTc))
     }
     times = {(camera, frame): int(maps[camera].times[frame]) for camera, frame in wTc}
-    state = _optimise(tuple(cameras), times, wTc, observations, {}, config)
+    centres = centres_of(cameras)
+    state = _optimise(tuple(cameras), centres, times, wTc, observations, {}, config)
     for radius in config.search_px:
         found = _search(state.cameras, maps, state.wTc, state.observations, radius, config.similarity)
-        state = _optimise(state.cameras, times, state.wTc, found, state.mounts, config)
+        state = _optimise(state.cameras, centres, times, state.wTc, found, state.mounts, config)
     for a, b in state.mounts:
         logger.info("%s and %s are mounted on one another", cameras[a].name, cameras[b].name)
     frames = {
@@ -140,7 +149,7 @@ def adjust_maps(
     return Adjusted(frames, state.cameras, deviations, _told_focal(state, times) if ask_focal else {})
 
 
-def _told_focal(state: _State, times: Mapping[Label, int]) -> dict[int, FocalLength]:
+def _told_focal(state: _State, times: Mapping[Label, int]) -> dict[int, FoundIntrinsics]:
     """What the images say of known focal lengths, all let go at once; of cameras with several frames and
     square pixels."""
     counts = Counter(camera for camera, _ in state.wTc)
@@ -157,11 +166,14 @@ def _told_focal(state: _State, times: Mapping[Label, int]) -> dict[int, FocalLen
         replace(camera, focal_known=camera.focal_known and index not in asked)
         for index, camera in enumerate(state.cameras)
     ]
-    bundle = bundle_of(freed, state.wTc, state.observations)
+    bundle = bundle_of(freed, state.wTc, state.observations, centres_of(freed), HELD)
     solution = solve_bundle(bundle.graph, bundle.values, times, state.mounts, *FOCAL_EFFORT)
     told = solved_cameras(freed, state.wTc, solution)
     deviations = focal_deviations(bundle, solution, asked)
-    return {index: FocalLength(told[index].fx, deviations[index]) for index in asked}
+    return {
+        index: FoundIntrinsics(told[index].fx, told[index].cx, told[index].cy, deviations[index])
+        for index in asked
+    }
 
 
 def _search(
@@ -327,6 +339,7 @@ def _choose_points(landmark: Index, camera: Index, count: int, per_camera: int) 
 
 def _optimise(
     cameras: tuple[Camera, ...],
+    centres: Sequence[tuple[float, float]],
     times: Mapping[Label, int],
     wTc: Mapping[Label, Array],
     observations: Observations,
@@ -335,10 +348,11 @@ def _optimise(
 ) -> _State:
     """Bundle adjustment with a redescending loss; sightings that do not fit afterwards are dropped.
 
+    ``centres`` are where principal points that are free are expected.
     ``mounts`` are held. Where there are none yet, cameras that move like a rig are tried as one, and their
     mounts returned if the images bear it out.
     """
-    bundle = bundle_of(cameras, wTc, observations)
+    bundle = bundle_of(cameras, wTc, observations, centres, config.centre_sigma)
     effort = config.maximum_iterations, config.relative_tolerance
     solution = solve_bundle(bundle.graph, bundle.values, times, mounts, *effort)
     mounts = solved_mounts(solution, mounts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -26,12 +26,15 @@ class StartFrame:
 
 
 @dataclass(frozen=True)
-class FocalLength:
-    """Of a camera that does not tell it, found in the images."""
+class FoundIntrinsics:
+    """What the images say of a camera with square pixels."""
 
-    pixels: float
+    focal: float
+    """px"""
+    cx: float
+    cy: float
     deviation: float
-    """Standard deviation, px."""
+    """Standard deviation of the focal length, px."""
 
 
 @dataclass(frozen=True)
@@ -44,20 +47,20 @@ class Start:
     """Per camera, in time order, at least one."""
     notes: tuple[str, ...] = ()
     """What a reader of the result must know, such as cameras whose place or depth nobody could see."""
-    focal: Mapping[int, FocalLength] = field(default_factory=dict)
+    intrinsics: Mapping[int, FoundIntrinsics] = field(default_factory=dict)
     """By camera index, of those whose focal length was not known."""
 
 
 def found_cameras(cameras: Sequence[Camera], start: Start) -> tuple[Camera, ...]:
-    """The cameras with the focal lengths that the start found.
+    """The cameras with the intrinsics that the start found.
 
     Raises TrackingError where one is neither known nor found.
     """
     result = list(cameras)
     for index, camera in enumerate(cameras):
-        if index in start.focal:
-            focal = start.focal[index].pixels
-            result[index] = replace(camera, fx=focal, fy=focal)
+        if index in start.intrinsics:
+            found = start.intrinsics[index]
+            result[index] = replace(camera, fx=found.focal, fy=found.focal, cx=found.cx, cy=found.cy)
         elif not camera.focal_known:
             raise TrackingError(
                 f"{camera.name}: the start did not find its focal length; give its intrinsics"
@@ -77,9 +80,9 @@ def start_to_arrays(start: Start) -> dict[str, npt.NDArray[np.float64]]:
         "count": np.array([len(frame.depth) for _, frame in frames], np.float64),
         "pixels": np.concatenate([frame.pixels for _, frame in frames]),
         "depth": np.concatenate([frame.depth for _, frame in frames]),
-        "focal": np.array(
-            [(camera, focal.pixels, focal.deviation) for camera, focal in start.focal.items()], np.float64
-        ).reshape(-1, 3),
+        "intrinsics": np.array(
+            [(camera, *astuple(found)) for camera, found in start.intrinsics.items()], np.float64
+        ).reshape(-1, 5),
     }
 
 
@@ -101,8 +104,8 @@ def start_from_arrays(arrays: Mapping[str, npt.NDArray[np.float64]]) -> Start:
         groups=tuple(tuple(np.flatnonzero(group == number).tolist()) for number in range(group.max() + 1)),
         frames=tuple(tuple(own) for own in frames),
         # starts of earlier versions have none
-        focal={
-            int(camera): FocalLength(float(pixels), float(deviation))
-            for camera, pixels, deviation in arrays.get("focal", np.zeros((0, 3)))
+        intrinsics={
+            int(camera): FoundIntrinsics(*found)
+            for camera, *found in arrays.get("intrinsics", np.zeros((0, 5))).tolist()
         },
     )

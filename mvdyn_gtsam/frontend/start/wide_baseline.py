@@ -23,7 +23,7 @@ from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
 from mvdyn_gtsam.frontend.start.camera_maps import MappedCamera, map_camera
 from mvdyn_gtsam.frontend.start.dense_map import DenseMap
-from mvdyn_gtsam.frontend.start.focal import doubts, told_focal
+from mvdyn_gtsam.frontend.start.focal import doubts, found_intrinsics
 from mvdyn_gtsam.frontend.start.groups import Judge, Placement, balance, connect
 from mvdyn_gtsam.frontend.start.joint_adjustment import FOCAL_EFFORT, Adjusted, adjust_maps
 from mvdyn_gtsam.frontend.start.lifted_points import lift_map, match_lifted
@@ -115,7 +115,7 @@ class ClassicalInitializer:
             groups=tuple(tuple(sorted(group)) for group in placed.groups),
             frames=tuple(frames.get(camera, ()) for camera in range(len(maps))),
             notes=tuple(doubt for one in adjusted for doubt in doubts(cameras, one)),
-            focal={camera: focal for one in adjusted for camera, focal in told_focal(one).items()},
+            intrinsics={camera: own for one in adjusted for camera, own in found_intrinsics(one).items()},
         )
         capture = replace(capture, cameras=found_cameras(capture.cameras, start))
         return _with_lone_cameras(capture, start, views)

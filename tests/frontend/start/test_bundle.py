@@ -22,6 +22,7 @@ from tests.frontend.start.synthetic_maps import CAMERA, cloud, poses
 Array = npt.NDArray[np.float64]
 SCENE = cloud(200)
 NOISE_PX = 0.3
+CENTRES = [(CAMERA.cx, CAMERA.cy)]
 UNKNOWN = replace(CAMERA, fx=1.05 * CAMERA.fx, fy=1.05 * CAMERA.fy, focal_known=False)
 
 
@@ -48,7 +49,7 @@ def first_sighting(seen: Observations) -> Observations:
 def solved(wTc: Array) -> tuple[float, float]:
     """Focal length and its deviation, from 5 % off."""
     labels = {(0, frame): pose for frame, pose in enumerate(wTc)}
-    bundle = bundle_of([UNKNOWN], labels, sightings(wTc))
+    bundle = bundle_of([UNKNOWN], labels, sightings(wTc), CENTRES, 0.005)
     solution = solve_bundle(bundle.graph, bundle.values, {label: label[1] for label in labels}, {}, 100, 1e-6)
     (camera,) = solved_cameras([UNKNOWN], labels, solution)
     assert camera.fx == camera.fy and not camera.focal_known
@@ -66,6 +67,21 @@ def test_the_focal_length_of_a_camera_that_turns_and_moves_is_found() -> None:
     focal, deviation = solved(turning())
     assert abs(focal / CAMERA.fx - 1.0) < 0.005
     assert abs(focal - CAMERA.fx) < 3.0 * deviation < 0.06 * CAMERA.fx
+
+
+def test_a_principal_point_off_the_centre_is_found_as_far_as_it_is_likely() -> None:
+    wTc, true = turning(), (CAMERA.cx + 6.0, CAMERA.cy)
+    labels = {(0, frame): pose for frame, pose in enumerate(wTc)}
+    seen = sightings(wTc)
+    moved = replace(seen, pixel=seen.pixel + [6.0, 0.0])
+    left = []
+    for sigma in (1e-4, 0.005, 0.05):
+        bundle = bundle_of([UNKNOWN], labels, moved, CENTRES, sigma)
+        ends = {label: label[1] for label in labels}
+        solution = solve_bundle(bundle.graph, bundle.values, ends, {}, 100, 1e-6)
+        (camera,) = solved_cameras([UNKNOWN], labels, solution)
+        left.append(np.hypot(camera.cx - true[0], camera.cy - true[1]))
+    assert abs(left[0] - 6.0) < 0.01 and left[2] < 2.0 and left[2] < left[1] < left[0]
 
 
 def test_a_camera_that_slides_without_turning_leaves_it_open() -> None:
@@ -89,7 +105,7 @@ def test_known_focal_lengths_are_held_and_tell_the_others() -> None:
         np.concatenate([first.pixel, second.pixel]),
         SCENE.points,
     )
-    bundle = bundle_of([CAMERA, UNKNOWN], labels, both)
+    bundle = bundle_of([CAMERA, UNKNOWN], labels, both, 2 * CENTRES, 0.005)
     assert not bundle.values.exists(F(0)) and bundle.values.exists(F(1))
     solution = solve_bundle(bundle.graph, bundle.values, {label: label[1] for label in labels}, {}, 100, 1e-6)
     known, found = solved_cameras([CAMERA, UNKNOWN], labels, solution)
@@ -101,17 +117,17 @@ def test_known_focal_lengths_are_held_and_tell_the_others() -> None:
 def test_what_cannot_be_solved_is_left_open() -> None:
     wTc = turning()[2:3]
     one = first_sighting(sightings(wTc))
-    bundle = bundle_of([UNKNOWN], {(0, 0): wTc[0]}, one)
+    bundle = bundle_of([UNKNOWN], {(0, 0): wTc[0]}, one, CENTRES, 0.005)
     # one sighting, and no gauge
     without = replace(bundle, graph=bundle.sightings)
     assert focal_deviations(without, without.values, [0]) == {0: np.inf}
     assert focal_deviations(without, without.values, []) == {}
 
 
-def test_the_residual_and_its_derivative_by_the_focal_length() -> None:
+def test_the_residual_and_its_derivative_by_the_intrinsics() -> None:
     wTc = turning()[2:3]
     one = first_sighting(sightings(wTc))
-    bundle = bundle_of([UNKNOWN], {(0, 0): wTc[0]}, one)
+    bundle = bundle_of([UNKNOWN], {(0, 0): wTc[0]}, one, CENTRES, 0.005)
     x, y, z = transform_points(invert_pose(wTc[0]), one.points)[0]
     wrong = UNKNOWN.fx * np.array([x / z, y / z]) + [UNKNOWN.cx, UNKNOWN.cy] - one.pixel[0]
     # both rows carry the root of Cauchy's weight
@@ -119,5 +135,7 @@ def test_the_residual_and_its_derivative_by_the_focal_length() -> None:
     factor = bundle.sightings.at(0).linearize(bundle.values)
     jacobian, right = factor.jacobian()
     assert factor.keys()[-1] == F(0)
+    # by fx, fy, skew, cx and cy
+    by_intrinsics = [[x / z, 0.0, y / z, 1.0, 0.0], [0.0, y / z, 0.0, 0.0, 1.0]]
     np.testing.assert_allclose(right, -weight * wrong, rtol=1e-6)
-    np.testing.assert_allclose(jacobian[:, -1], weight * np.array([x / z, y / z]), rtol=1e-6)
+    np.testing.assert_allclose(jacobian[:, -5:], weight * np.array(by_intrinsics), rtol=1e-6)

@@ -12,9 +12,9 @@ import pytest
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.start import focal
 from mvdyn_gtsam.frontend.start.features import extract_features
-from mvdyn_gtsam.frontend.start.focal import MOST_DEVIATION, doubts, focal_candidates, told_focal
+from mvdyn_gtsam.frontend.start.focal import MOST_DEVIATION, doubts, focal_candidates, found_intrinsics
 from mvdyn_gtsam.frontend.start.joint_adjustment import Adjusted
-from mvdyn_gtsam.frontend.start.model import FocalLength
+from mvdyn_gtsam.frontend.start.model import FoundIntrinsics
 from mvdyn_gtsam.frontend.start.single_camera import match_neighbours
 from tests.frontend.start.synthetic_maps import CAMERA
 from tests.tracking.synthetic_scene import two_cameras
@@ -60,15 +60,15 @@ def test_what_the_images_leave_open_is_refused() -> None:
     def adjusted(deviation: float) -> Adjusted:
         return Adjusted({}, (CAMERA, UNKNOWN), {1: deviation}, {})
 
-    assert told_focal(adjusted(2.0)) == {1: FocalLength(384.0, 2.0)}
+    assert found_intrinsics(adjusted(2.0)) == {1: FoundIntrinsics(384.0, CAMERA.cx, CAMERA.cy, 2.0)}
     for deviation in (1.1 * MOST_DEVIATION * 384.0, np.inf, np.nan):
         with pytest.raises(TrackingError, match="384 px fits best"):
-            told_focal(adjusted(deviation))
+            found_intrinsics(adjusted(deviation))
 
 
 def test_given_focal_lengths_that_the_images_contradict_are_doubted() -> None:
-    def lines(pixels: float, deviation: float) -> list[str]:
-        told = {0: FocalLength(pixels, deviation)}
+    def lines(focal: float, deviation: float) -> list[str]:
+        told = {0: FoundIntrinsics(focal, CAMERA.cx, CAMERA.cy, deviation)}
         return doubts([CAMERA, UNKNOWN], Adjusted({}, (CAMERA, UNKNOWN), {}, told))
 
     assert lines(430.0, 0.5) == []

@@ -133,8 +133,8 @@ def test_images_tell_the_focal_lengths_whether_they_are_known_or_not() -> None:
     # what is known is kept, and doubted
     assert known.cameras == (wrong, wrong) and known.focal_deviation == {}
     for told in known.told_focal.values():
-        assert abs(told.pixels / CAMERA.fx - 1.0) < 0.01 < wrong.fx / CAMERA.fx - 1.0
-        assert abs(told.pixels - CAMERA.fx) < 3.0 * told.deviation
+        assert abs(told.focal / CAMERA.fx - 1.0) < 0.01 < wrong.fx / CAMERA.fx - 1.0
+        assert abs(told.focal - CAMERA.fx) < 3.0 * told.deviation
     assert len(known.told_focal) == 2
     assert adjust_maps([wrong, wrong], maps, group, pairs, config).told_focal == {}
     mixed = adjust_maps([oblong, unknown], maps, group, pairs, config, ask_focal=True)

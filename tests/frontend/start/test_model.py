@@ -10,7 +10,7 @@ import pytest
 from mvdyn_gtsam.capture.model import Camera
 from mvdyn_gtsam.errors import TrackingError
 from mvdyn_gtsam.frontend.start.model import (
-    FocalLength,
+    FoundIntrinsics,
     Start,
     StartFrame,
     found_cameras,
@@ -34,14 +34,14 @@ def test_arrays_and_back_through_a_file() -> None:
             (frame(0, 0, random),),  # a camera that saw no depth
             (frame(3, 4, random),),
         ),
-        focal={2: FocalLength(412.5, 0.75)},
+        intrinsics={2: FoundIntrinsics(412.5, 31.0, 24.0, 0.75)},
     )
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **start_to_arrays(start))
     buffer.seek(0)
     with np.load(buffer, allow_pickle=False) as arrays:
         again = start_from_arrays(dict(arrays))
-    assert again.groups == start.groups and again.focal == start.focal
+    assert again.groups == start.groups and again.intrinsics == start.intrinsics
     assert [len(own) for own in again.frames] == [3, 1, 1]
     for own, expected in zip(again.frames, start.frames, strict=True):
         for one, other in zip(own, expected, strict=True):
@@ -52,20 +52,20 @@ def test_arrays_and_back_through_a_file() -> None:
             assert one.pixels.shape == (len(one.depth), 2)
 
 
-def test_a_start_of_earlier_versions_has_no_focal_lengths() -> None:
+def test_a_start_of_earlier_versions_has_no_intrinsics() -> None:
     random = np.random.default_rng(0)
     arrays = start_to_arrays(Start(((0,),), ((frame(0, 5, random),),)))
-    del arrays["focal"]
-    assert start_from_arrays(arrays).focal == {}
+    del arrays["intrinsics"]
+    assert start_from_arrays(arrays).intrinsics == {}
 
 
-def test_cameras_take_the_focal_length_that_was_found() -> None:
+def test_cameras_take_the_intrinsics_that_were_found() -> None:
     known = Camera("known", 64, 48, 50.0, 51.0, 31.5, 23.5)
     unknown = Camera("unknown", 64, 48, 48.0, 48.0, 31.5, 23.5, focal_known=False)
-    start = Start(((0, 1),), ((), ()), focal={1: FocalLength(52.0, 0.1)})
+    start = Start(((0, 1),), ((), ()), intrinsics={1: FoundIntrinsics(52.0, 31.0, 24.0, 0.1)})
     assert found_cameras((known, unknown), start) == (
         known,
-        Camera("unknown", 64, 48, 52.0, 52.0, 31.5, 23.5, focal_known=False),
+        Camera("unknown", 64, 48, 52.0, 52.0, 31.0, 24.0, focal_known=False),
     )
     # an initializer that does not look for it must not let the first guess pass for known
     with pytest.raises(TrackingError, match="unknown: the start did not find its focal length"):
