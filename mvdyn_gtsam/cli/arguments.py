@@ -48,8 +48,8 @@ def add_estimate_focal_argument(parser: argparse.ArgumentParser, more: str = "")
         "--estimate-focal",
         action="store_true",
         help="the focal lengths are not known: find each camera's in its video. The camera must move from its"
-        " place (turning is not enough) and have square pixels and no distortion."
-        " Intrinsics that are given are first guesses, and their cx,cy stay. For some cameras only:"
+        " place (turning is not enough) and have square pixels, no distortion, and a principal point near the"
+        " centre, or near cx,cy. Intrinsics that are given are first guesses. For some cameras only:"
         f' "estimate_focal": true in capture.json{more}',
     )
 
