@@ -16,6 +16,7 @@ from experiments import (
     accuracy,
     factor_cost,
     flow_accuracy,
+    focal,
     refinement_phases,
     refinement_pictures,
     scaling,
@@ -93,6 +94,15 @@ def test_wide_baseline(results: Path) -> None:
     [entry] = runs(results, "wide_baseline")
     assert entry["problem"] is None and entry["pairs"]
     is_whole(results, "wide_baseline")
+
+
+def test_focal(results: Path) -> None:
+    assert focal.main(["--quick", "--results", str(results)]) == 0
+    [entry] = runs(results, "focal")
+    assert entry["problem"] is None and entry["tracking"] is None
+    for camera in entry["cameras"]:
+        assert abs(camera["found_px"] / camera["true_px"] - 1.0) < 0.01
+    assert (results / "focal.md").read_text().count("| quick_2x14 |") == 4
 
 
 def test_accuracy_of_ours_and_a_baseline(results: Path) -> None:

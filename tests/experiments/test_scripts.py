@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-SCRIPTS = ("accuracy", "factor_cost", "flow_accuracy", "scaling", "wide_baseline")
-LONG = ("accuracy", "scaling", "wide_baseline")
+SCRIPTS = ("accuracy", "factor_cost", "flow_accuracy", "focal", "scaling", "wide_baseline")
+LONG = ("accuracy", "focal", "scaling", "wide_baseline")
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
