@@ -31,8 +31,8 @@ none beyond use, 150 six and two, 100 five and two, all tracks five and two."""
 
 
 FITTING_PX = 0.5
-"""Reprojection error up to which a sighting speaks for a focal length. Source: experiments/focal.py; of the
-minima that bundle adjustment ends in, the true one had 1.3 times as many as any other."""
+"""Reprojection error up to which a sighting speaks for a focal length. Source: choice; about what SIFT is
+good to."""
 
 
 def main(source: str, target: str) -> int:

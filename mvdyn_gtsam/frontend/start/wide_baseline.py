@@ -55,8 +55,9 @@ class WideBaselineInitializer(Protocol):
     """Anything that places the cameras: classical, or a feed-forward network such as VGGT behind ONNX."""
 
     def __call__(self, capture: Capture, progress: Progress) -> Start:
-        """Poses and sparse depths of some frames of every camera. Raises TrackingError when nothing can
-        be placed at all."""
+        """Poses and sparse depths of some frames of every camera, and the intrinsics of those whose focal
+        length is not known. Raises TrackingError when nothing can be placed at all, or a focal length is
+        neither known nor found."""
         ...
 
 
