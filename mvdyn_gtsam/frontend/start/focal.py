@@ -33,7 +33,6 @@ SAME = 0.02
 LEAST_FITTING = 0.3
 """Share of the most fitting sightings that an end needs to be considered. Source: choice; true ones had 0.56
 and more in experiments/focal.py."""
-
 MOST_DEVIATION = 0.01
 """Standard deviation from which on a focal length is not told, as a share of it. Source:
 experiments/focal.py."""
