@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 FIRST_FOCAL = 0.75
 """Focal length that is guessed where none is given, as a share of the longer image side: about that of a
-phone's main camera while it films video."""
+phone's main camera while it films video. Source: choice; 26 mm on 36 mm wide film, cropped a little."""
 
 
 @dataclass(frozen=True)

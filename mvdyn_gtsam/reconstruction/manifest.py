@@ -22,6 +22,8 @@ FORMAT = "mvdyn-reconstruction"
 SCHEMA = 1
 """Raised when a reader of the old layout would misread the new one."""
 MANIFEST_NAME = "manifest.json"
+FOUND_KEYS = ("fx", "fy", "cx", "cy")
+"""Of a camera whose intrinsics were found, px."""
 
 CONVENTIONS = {
     "trajectories": "TUM lines 'timestamp tx ty tz qx qy qz qw' of wTc, the pose of the camera in the world"
@@ -165,10 +167,7 @@ def cameras_of(manifest: Mapping[str, Any]) -> tuple[Camera, ...]:
 
 def _found_intrinsics(manifest: Mapping[str, Any], camera: str) -> dict[str, float]:
     found = manifest.get("found_intrinsics", {}).get(camera)
-    if found is None:
-        return {}
-    focal = float(found["focal"])
-    return {"fx": focal, "fy": focal, "cx": float(found["cx"]), "cy": float(found["cy"])}
+    return {} if found is None else {key: float(found[key]) for key in FOUND_KEYS}
 
 
 def _layout_problem(manifest: Mapping[str, Any]) -> str | None:
@@ -188,7 +187,7 @@ def _layout_problem(manifest: Mapping[str, Any]) -> str | None:
         return '"capture" has an fps that is not positive'
     try:
         names = [camera.name for camera in cameras_of(manifest)]
-    except (KeyError, TypeError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         return f'"capture" has cameras that cannot be read ({error})'
     return _groups_problem(manifest["groups"], names)
 

@@ -28,6 +28,7 @@ from mvdyn_gtsam.reconstruction.layout import (
     trajectory_path,
 )
 from mvdyn_gtsam.reconstruction.manifest import (
+    FOUND_KEYS,
     MANIFEST_NAME,
     CaptureInfo,
     Status,
@@ -253,7 +254,7 @@ class ReconstructionWriter:
         for camera in found:
             self._check_camera(camera)
         self._manifest["found_intrinsics"] = {
-            name: {"focal": camera.fx, "cx": camera.cx, "cy": camera.cy, "deviation": deviation.get(name)}
+            name: {**{key: getattr(camera, key) for key in FOUND_KEYS}, "deviation": deviation.get(name)}
             for name, camera in found.items()
         }
         self._write_manifest()

@@ -213,14 +213,14 @@ def test_focal_lengths_that_are_found_are_the_cameras(tmp_path: Path) -> None:
         assert writer.cameras == info.cameras
         with pytest.raises(ValueError, match="unknown camera 'cam7'"):
             writer.set_found_intrinsics({"cam7": info.cameras[0]}, {})
-        found = dataclasses.replace(info.cameras[0], fx=30.5, fy=30.5, cx=15.25, cy=11.75)
+        found = dataclasses.replace(info.cameras[0], fx=30.5, fy=30.75, cx=15.25, cy=11.75)
         writer.set_found_intrinsics({"cam0": found}, {"cam0": 0.2})
         assert writer.cameras == (found, info.cameras[1])
     result = Reconstruction.load(tmp_path)
     assert result.camera("cam0") == found
     assert result.camera("left phone") == info.cameras[1]
-    assert result.intrinsics("cam0")[[0, 1, 0], [0, 1, 2]].tolist() == [30.5, 30.5, 15.25]
-    entry = {"focal": 30.5, "cx": 15.25, "cy": 11.75, "deviation": 0.2}
+    assert result.intrinsics("cam0")[[0, 1, 0], [0, 1, 2]].tolist() == [30.5, 30.75, 15.25]
+    entry = {"fx": 30.5, "fy": 30.75, "cx": 15.25, "cy": 11.75, "deviation": 0.2}
     assert result.manifest["found_intrinsics"] == {"cam0": entry}
     # the guess stays beside it, so that a resumed run knows its capture
     with ReconstructionWriter.create(tmp_path, info, CONFIG, resume=True) as writer:

@@ -38,7 +38,7 @@ MOST_DEVIATION = 0.01
 experiments/focal.py."""
 DOUBTED = 0.01
 """By how much of it a given focal length must differ from what the images tell, to be doubted. Source:
-experiments/focal.py; twice what found ones were off on rendered scenes."""
+experiments/focal.py; more than twice what found ones were off on whole rendered images."""
 DOUBTED_DEVIATIONS = 5.0
 """And by how many standard deviations. Source: choice."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -29,6 +28,7 @@ from mvdyn_gtsam.frontend.start.bundle import (
     free_cameras,
     solve_bundle,
     solved_cameras,
+    told_intrinsics,
 )
 from mvdyn_gtsam.frontend.start.features import Features
 from mvdyn_gtsam.frontend.start.model import FoundIntrinsics, StartFrame
@@ -40,15 +40,6 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 logger = logging.getLogger(__name__)
 
-LEAST_FRAMES = 3
-"""Of a camera, for its images to be asked for its focal length: those of a still one are a single image."""
-HELD = 1e-4
-"""For ``centre_sigma``: known principal points stay."""
-SQUARE = 0.002
-"""Share by which the two focal lengths of square pixels differ at most; calibrations find them that alike."""
-FOCAL_EFFORT = 100, 1e-5
-"""Iterations at most, and the share by which the cost falls in the last: a focal length that is let go
-follows a narrow valley. Source: experiments/focal.py."""
 MISFIT_PX = 4.0
 """Reprojection error beyond which a sighting is dropped; COLMAP's filter_max_reproj_error."""
 
@@ -69,7 +60,8 @@ class AdjustmentConfig:
     """Relative decrease of the cost at which a round ends. Source: choice, time."""
     centre_sigma: float = 0.005
     """Standard deviation of a principal point that is not known from what is given, or from the image's
-    centre, in lengths of the longer side. Source: experiments/focal.py, 0 to 0.01."""
+    centre, in lengths of the longer side. Source: experiments/focal.py, next to nothing and this; twice as
+    much was alike in a trial that is not kept."""
     rig: RigConfig = field(default_factory=RigConfig)
 
     def __post_init__(self) -> None:
@@ -146,34 +138,12 @@ def adjust_maps(
     }
     free = free_cameras(cameras, wTc)
     deviations = focal_deviations(state.bundle, state.solution, free)
-    return Adjusted(frames, state.cameras, deviations, _told_focal(state, times) if ask_focal else {})
-
-
-def _told_focal(state: _State, times: Mapping[Label, int]) -> dict[int, FoundIntrinsics]:
-    """What the images say of known focal lengths, all let go at once; of cameras with several frames and
-    square pixels."""
-    counts = Counter(camera for camera, _ in state.wTc)
-    asked = [
-        index
-        for index, count in counts.items()
-        if (camera := state.cameras[index]).focal_known
-        and count >= LEAST_FRAMES
-        and abs(camera.fy / camera.fx - 1.0) < SQUARE
-    ]
-    if not asked:
-        return {}
-    freed = [
-        replace(camera, focal_known=camera.focal_known and index not in asked)
-        for index, camera in enumerate(state.cameras)
-    ]
-    bundle = bundle_of(freed, state.wTc, state.observations, centres_of(freed), HELD)
-    solution = solve_bundle(bundle.graph, bundle.values, times, state.mounts, *FOCAL_EFFORT)
-    told = solved_cameras(freed, state.wTc, solution)
-    deviations = focal_deviations(bundle, solution, asked)
-    return {
-        index: FoundIntrinsics(told[index].fx, told[index].cx, told[index].cy, deviations[index])
-        for index in asked
-    }
+    told = (
+        told_intrinsics(state.cameras, times, state.wTc, state.observations, state.mounts)
+        if ask_focal
+        else {}
+    )
+    return Adjusted(frames, state.cameras, deviations, told)
 
 
 def _search(

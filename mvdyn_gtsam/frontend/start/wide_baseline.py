@@ -21,11 +21,12 @@ import numpy.typing as npt
 from mvdyn_gtsam.capture.model import Camera, Capture
 from mvdyn_gtsam.frontend.dense_flow import DenseFlow
 from mvdyn_gtsam.frontend.grid_flow import OneWayFlow
+from mvdyn_gtsam.frontend.start.bundle import FOCAL_EFFORT
 from mvdyn_gtsam.frontend.start.camera_maps import MappedCamera, map_camera
 from mvdyn_gtsam.frontend.start.dense_map import DenseMap
 from mvdyn_gtsam.frontend.start.focal import doubts, found_intrinsics
 from mvdyn_gtsam.frontend.start.groups import Judge, Placement, balance, connect
-from mvdyn_gtsam.frontend.start.joint_adjustment import FOCAL_EFFORT, Adjusted, adjust_maps
+from mvdyn_gtsam.frontend.start.joint_adjustment import Adjusted, adjust_maps
 from mvdyn_gtsam.frontend.start.lifted_points import lift_map, match_lifted
 from mvdyn_gtsam.frontend.start.model import Start, found_cameras
 from mvdyn_gtsam.frontend.start.placement import (
